@@ -64,6 +64,7 @@ class WorkerActor:
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
+        from workers.gpu import platform_of_gpu
         from workers.parents import Parents
         from workers.rollouts import BACKENDS
 
@@ -71,9 +72,7 @@ class WorkerActor:
         self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(self._environment):
             self._run_chunks = make_worker_with_cores(spec, self._cores)
-        if not self._gpus:
-            return platform_text(platform_info())
-        return platform_text(platform_info() | {"device": BACKENDS[spec.rollout].device()})
+        return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
     def compile(self, chunks: bytes, *parts: bytes) -> float:
         """Compile for chunks without running them; returns the seconds that it took. The arguments are those of `run`.

@@ -1,7 +1,7 @@
 """Workers as threads of a child process that the inline engine starts, usually one thread per process.
 
-Each worker receives chunks and sends results over its own socket. The parent sets the environment (one XLA thread, CPU)
-before this interpreter starts, so the results never depend on the parent's use of JAX.
+Each worker receives chunks and sends results over its own socket. The parent sets the environment (one XLA thread; the
+CPU or a GPU) before this interpreter starts, so the results never depend on the parent's use of JAX.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
+from workers.gpu import platform_of_gpu
 from workers.parents import Parents
 from workers.rollouts import BACKENDS
 from workers.xla_cache import xla_cache_settings
@@ -36,10 +37,10 @@ def main(descriptor: int, parent: int) -> None:
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
     worker's socket. A worker receives ("subject", number, Subject), ("parents", {name: parameters or Origin}) and
     ("chunks", item, attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It
-    sends ("broken", RaisedError), or ("up",) and then for each work item ("results", item, attempt, [ChunkResult]),
-    ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies, ("lacks", item,
-    attempt). Before it computes the first work item of a kind, it compiles for it and sends ("compiled", kind,
-    seconds).
+    sends ("broken", RaisedError), or ("up", `platform_of_gpu`) and then for each work item ("results", item, attempt,
+    [ChunkResult]), ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies,
+    ("lacks", item, attempt). Before it computes the first work item of a kind, it compiles for it and sends
+    ("compiled", kind, seconds).
     """
     end_with(parent)
     with socket.socket(fileno=descriptor) as control:
@@ -98,7 +99,7 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
     if isinstance(run_chunks, RaisedError):
         parent.sendall(framed(("broken", run_chunks)))
         return
-    parent.sendall(framed(("up",)))
+    parent.sendall(framed(("up", platform_of_gpu(spec.rollout))))
     subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
     parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
     compiled: set[str] = set()

@@ -8,6 +8,7 @@ different bits for another batch shape.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,17 +20,25 @@ from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, W
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
+from workers.policies.pairs import act_in_pairs
 from workers.policies.policy import act, split_layers
 
+Policies = Callable[[Any, Any], tuple[Any, Any]]
+"""Function (memory_L_H, observation_L_O) -> (outputs_L_A, memory_L_H) of the policies of all lanes, as `act`."""
 
-def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
+
+def make_training_rollout(environment: Environment, spec: WorkerSpec, *, in_pairs: bool = False) -> Compilable:
     """Rollout of one training chunk, see `ChunkFunctions.training`.
 
     Pairs step in blocks of `rollout_block_pairs`, one block after the other, so that a block's weights stay in cache.
+
+    Args:
+        in_pairs: whether policies are computed as in `policies/pairs.py`, which is how a GPU does it.
     """
     episodes = _make_member_episodes(environment, spec)
     block_pairs = spec.rollout_block_pairs
@@ -40,10 +49,14 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compila
         def block(keys):
             noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E = keys
             noise_P_D = jax.vmap(lambda key: normal_integers(jnp, key, coordinates_D))(noise_keys_P)
-            offset_P_D = unit * noise_P_D.astype(jnp.float32)
-            parameters_P_S_D = centre_D + signs_S[None, :, None] * offset_P_D[:, None, :]
+            if in_pairs:
+                policies = act_in_pairs(spec.policy, centre_D, unit, noise_P_D)
+            else:
+                offset_P_D = unit * noise_P_D.astype(jnp.float32)
+                parameters_P_S_D = centre_D + signs_S[None, :, None] * offset_P_D[:, None, :]
+                policies = _act_each(spec.policy, parameters_P_S_D.reshape(2 * block_pairs, -1))
             result_PS = episodes(
-                parameters_P_S_D.reshape(2 * block_pairs, -1),
+                policies,
                 mean_O,
                 std_O,
                 *(keys.reshape(2 * block_pairs, *keys.shape[2:]) for keys in (reset_keys_P_S_E, action_keys_P_S_E)),
@@ -63,7 +76,8 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
 
     Episodes that are not wanted are computed all the same, since a program that stopped earlier could have other bits.
     """
-    episodes = jitted(_make_episodes(environment, spec, training=False))
+    evaluated = _make_episodes(environment, spec, training=False)
+    episodes = jitted(lambda centre_D, *given: evaluated(_act_shared(spec.policy, centre_D), *given))
     return Compilable(
         lambda centre_D, mean_O, std_O, reset_keys_E, wanted_E: episodes(centre_D, mean_O, std_O, reset_keys_E),
         lambda centre_D, mean_O, std_O, reset_keys_E, wanted_E: episodes.compile(centre_D, mean_O, std_O, reset_keys_E),
@@ -75,7 +89,8 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
 
     Lanes repeat to fill the chunk, whose shape never changes.
     """
-    episodes = jitted(_make_episodes(environment, spec, training=False, own_weights=True))
+    evaluated = _make_episodes(environment, spec, training=False, own_statistics=True)
+    episodes = jitted(lambda parameters_L_D, *given: evaluated(_act_each(spec.policy, parameters_L_D), *given))
 
     def filled(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         lane_L = np.minimum(np.arange(POLICY_SLOTS), len(policy_L) - 1)
@@ -103,7 +118,8 @@ def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weig
         step until the episode is done; the rest is 0.
     """
     lanes = POLICY_SLOTS if own_weights else EVALUATION_EPISODES_PER_CHUNK
-    episodes = _make_episodes(environment, spec, training=False, own_weights=own_weights, watched=True)
+    episodes = _make_episodes(environment, spec, training=False, own_statistics=own_weights, watched=True)
+    policies = _act_each if own_weights else _act_shared
 
     def rollout(centre_D, mean_O, std_O, reset_key, slot):
         def in_lanes(array):
@@ -111,7 +127,7 @@ def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weig
 
         if own_weights:
             centre_D, mean_O, std_O = map(in_lanes, (centre_D, mean_O, std_O))
-        return episodes(centre_D, mean_O, std_O, in_lanes(reset_key), slot=slot)
+        return episodes(policies(spec.policy, centre_D), mean_O, std_O, in_lanes(reset_key), slot=slot)
 
     return jax.jit(rollout)
 
@@ -134,46 +150,52 @@ def make_gradient_sum(parameters: int) -> Compilable:
     return jitted(gradient_sum)
 
 
+def _act_each(policy: PolicySpec, parameters_L_D: Any) -> Policies:
+    """The policies of lanes that each have their own parameters."""
+    layers = jax.vmap(partial(split_layers, policy))(parameters_L_D)  # inside a loop this would copy them in every step
+    acts = jax.vmap(partial(act, jnp, policy))
+    return lambda memory_L_H, observation_L_O: acts(layers, memory_L_H, observation_L_O)
+
+
+def _act_shared(policy: PolicySpec, parameters_D: Any) -> Policies:
+    """The policies of lanes that share their parameters."""
+    layers = split_layers(policy, parameters_D)
+    acts = jax.vmap(partial(act, jnp, policy), in_axes=(None, 0, 0))
+    return lambda memory_L_H, observation_L_O: acts(layers, memory_L_H, observation_L_O)
+
+
 def _make_member_episodes(environment: Environment, spec: WorkerSpec):
     """Function that runs all episodes of each member, one after another.
 
     Returns:
-        f(parameters_M_D, mean_O, std_O, reset_keys_M_E_4, action_keys_M_E_4) -> Episodes with leading axes [M, E].
+        f(policies, mean_O, std_O, reset_keys_M_E_4, action_keys_M_E_4) -> Episodes with leading axes [M, E].
     """
     one_each = _make_episodes(environment, spec, training=True)
 
-    def episodes(parameters_M_D, mean_O, std_O, reset_keys_M_E, action_keys_M_E):
+    def episodes(policies, mean_O, std_O, reset_keys_M_E, action_keys_M_E):
         by_episode = (jnp.swapaxes(reset_keys_M_E, 0, 1), jnp.swapaxes(action_keys_M_E, 0, 1))
-        all_E_M = lax.map(lambda keys: one_each(parameters_M_D, mean_O, std_O, *keys), by_episode)
+        all_E_M = lax.map(lambda keys: one_each(policies, mean_O, std_O, *keys), by_episode)
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), all_E_M)
 
     return episodes
 
 
 def _make_episodes(
-    environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False, watched: bool = False
+    environment: Environment, spec: WorkerSpec, *, training: bool, own_statistics: bool = False, watched: bool = False
 ):
     """Function that runs one episode per lane.
 
     Returns:
-        f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training,
-        every lane has its own parameters [L, D] and action noise; otherwise all lanes share parameters [D], or with
-        `own_weights` every lane has its own parameters [L, D] and statistics [L, O]. If `watched`, the function has an
-        argument `slot` and returns the carries [T + 1] of that lane instead.
+        f(policies, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training
+        there is action noise. With `own_statistics` every lane has its own statistics [L, O]. If `watched`, the
+        function has an argument `slot` and returns the carries [T + 1] of that lane instead.
     """
     steps = episode_steps(environment, spec, training=training)
-    by_lane, of_statistics = 0 if training or own_weights else None, 0 if own_weights else None
-    policies = jax.vmap(lambda *given: act(jnp, spec.policy, *given), in_axes=(by_lane, 0, 0))
+    of_statistics = 0 if own_statistics else None
     observe = jax.vmap(steps.normalised_observation, in_axes=(0, of_statistics, of_statistics))
     advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0))
 
-    def split(parameters_D):
-        return split_layers(spec.policy, parameters_D)
-
-    def episodes(parameters, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
-        layers = (
-            split(parameters) if by_lane is None else jax.vmap(split)(parameters)
-        )  # inside the loop this would copy them in every step
+    def episodes(policies: Policies, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
 
         def keep(seen_T: Carry | None, step: Any, carry: Carry) -> Carry | None:
@@ -181,7 +203,7 @@ def _make_episodes(
 
         def body(at: tuple[Any, Carry, Any, Carry | None]) -> tuple[Any, Carry, Any, Carry | None]:
             step, carry, of_steps_T_L, seen_T = at
-            outputs_L, memory_L_H = policies(layers, carry.memory_H, observe(carry, mean_O, std_O))
+            outputs_L, memory_L_H = policies(carry.memory_H, observe(carry, mean_O, std_O))
             moved = advance(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
             of_steps_T_L = {name: kept.at[step].set(moved.episode.outputs[name]) for name, kept in of_steps_T_L.items()}
             return step + 1, moved, of_steps_T_L, keep(seen_T, step, carry)

@@ -10,7 +10,7 @@ from es_service.config.fields import Count, NotNegative, Patience, Positive, Sec
 
 
 class WorkerResources(Section):
-    """Resources that Ray reserves for one actor (engine ray)."""
+    """Resources of one worker."""
 
     cpu: Literal["auto"] | Count = Field(
         "auto",
@@ -19,8 +19,8 @@ class WorkerResources(Section):
     )
     gpu: NotNegative = Field(
         0.0,
-        description="GPUs that Ray reserves for each actor. With a fraction below 1, actors share a GPU; with 0, "
-        "episodes run on the CPU.",
+        description="GPUs of each worker. With a fraction below 1, workers share a GPU; with 0, episodes run on the "
+        "CPU. Its kind is a constant of the run: a GPU has bits of its own.",
     )
 
 
@@ -29,8 +29,8 @@ class ComputeConfig(Section):
 
     engine: Literal["ray", "inline"] = Field(
         description="How the workers run. inline: as child processes of this program. ray: as Ray actors, on this "
-        "machine or in a cluster. auto: ray if an address is given or workers need a GPU, else inline, which starts "
-        "sooner and sends messages faster."
+        "machine or in a cluster. auto: ray if an address is given or actors have several cores, else inline, which "
+        "starts sooner and sends messages faster."
     )
     inline_workers: Literal["processes", "threads"] = Field(
         "processes",
@@ -44,9 +44,10 @@ class ComputeConfig(Section):
     )
     workers: Literal["auto"] | Count = Field(
         "auto",
-        description="Number of workers, each of which is a core. auto: every core of the machine or cluster that has "
-        "work; with a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is "
-        "work for, in whole actors. It never changes results.",
+        description="Number of workers, each of which is a core, or with GPUs its share of them. auto: every core of "
+        "the machine or cluster that has work, or with the engine inline and GPUs as many as these have room for; with "
+        "a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is work for, in "
+        "whole actors. It never changes results.",
     )
     platform: Literal["any", "x86_64", "aarch64"] = Field(
         "any",
@@ -60,7 +61,7 @@ class ComputeConfig(Section):
     )
     worker_resources: WorkerResources = Field(
         default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),
-        description="With engine ray: resources that Ray reserves for one actor.",
+        description="Resources of one worker, which Ray reserves for its actor if the engine is ray.",
     )
     rollout: Text = Field(
         description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
@@ -118,7 +119,7 @@ class ComputeConfig(Section):
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
 """Keys of `compute` that affect floating-point results and are therefore constants of the run."""
 ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
-    "inline": {"compute.address": None, "compute.worker_resources.cpu": "auto", "compute.worker_resources.gpu": 0},
+    "inline": {"compute.address": None, "compute.worker_resources.cpu": "auto"},
     "ray": {"compute.inline_workers": "processes"},
 }
 """Engine -> settings that only the other engine uses, with the values that they must have with this one."""

@@ -49,6 +49,10 @@ MOST_ROLLOUT_BLOCK_PAIRS = 32
 """Enough pairs to fill vector units."""
 MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
 """If the weights of the pairs that step together are larger, they do not fit into a core's share of the cache."""
+MOST_GPU_PAIRS = 4096
+"""With GPUs: most pairs of a chunk, which all step together, since a GPU takes about as long for few as for many."""
+MOST_GPU_BLOCK_BYTES = 2**33
+"""With GPUs: most bytes of the weights of pairs that step together."""
 MOST_GRADIENT_BLOCKS = 32
 """A partial gradient is as large as the policy, so a generation should send only a few."""
 LEAST_GRADIENT_BLOCK_NUMBERS = 4_000_000
@@ -80,12 +84,14 @@ def default_chunk_pairs(pairs: int, limits: tuple[int, int] = CHUNK_PAIRS) -> in
     return max([size for size in divisors if size % 8 == 0] or divisors)
 
 
-def default_rollout_block_pairs(chunk_pairs: int, parameters: int) -> int:
-    """The largest divisor of `chunk_pairs` up to 32 whose weights (float32, both signs) take at most 5 MiB.
+def default_rollout_block_pairs(chunk_pairs: int, parameters: int, *, gpu: bool = False) -> int:
+    """The largest divisor of `chunk_pairs` up to 32 whose weights (float32, both signs) take at most 5 MiB; on a GPU
+    without the limit of 32, and up to 8 GiB.
 
     (64, 4482) -> 32; (40, 75528) -> 8.
     """
-    most = max(1, min(MOST_ROLLOUT_BLOCK_PAIRS, MOST_ROLLOUT_BLOCK_BYTES // (2 * 4 * parameters)))
+    pairs, size = (chunk_pairs, MOST_GPU_BLOCK_BYTES) if gpu else (MOST_ROLLOUT_BLOCK_PAIRS, MOST_ROLLOUT_BLOCK_BYTES)
+    most = max(1, min(pairs, size // (2 * 4 * parameters)))
     return max(size for size in range(1, most + 1) if chunk_pairs % size == 0)
 
 
@@ -133,7 +139,7 @@ def resolve(
         values["search.centres"] = default_centres(values, settings)
     if "compute.engine" in left_open:
         has_actor_cores = _value(values, f"{RESOURCES}cpu") not in ("auto", 1)
-        for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
+        for_ray = _value(values, "compute.address") is not None or has_actor_cores
         values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
         shape, gpu, here = _policy_spec(values, task), _on_gpu(values), _is_here(values)
@@ -142,14 +148,17 @@ def resolve(
     pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
     if pairs is not None and "compute.chunk_pairs" in left_open:
         rollout = rollouts.get(values.get("compute.rollout", ""))
-        values["compute.chunk_pairs"] = default_chunk_pairs(
-            pairs, rollout.pair_limits(task) if rollout and task else CHUNK_PAIRS
-        )
+        limits = rollout.pair_limits(task) if rollout and task else CHUNK_PAIRS
+        if _on_gpu(values):
+            limits = (MOST_GPU_PAIRS, MOST_GPU_PAIRS)
+        values["compute.chunk_pairs"] = default_chunk_pairs(pairs, limits)
     chunk_pairs = values.get("compute.chunk_pairs")
     if chunk_pairs is not None and task is not None:
         parameters = _policy_spec(values, task).parameters
         if "compute.rollout_block_pairs" in left_open:
-            values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, parameters)
+            values["compute.rollout_block_pairs"] = default_rollout_block_pairs(
+                chunk_pairs, parameters, gpu=_on_gpu(values)
+            )
         if "compute.gradient_block_pairs" in left_open and pairs is not None:
             values["compute.gradient_block_pairs"] = default_gradient_block_pairs(pairs, chunk_pairs, parameters)
     if isinstance(values.get("search.init_from"), str):
@@ -240,8 +249,8 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
 
 
 def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Problem]:
-    """Problems of a cluster or GPU without Ray, of threads with a rollout that has none, and of a share of GPUs that
-    Ray cannot assign."""
+    """Problems of a cluster without Ray, of threads with a rollout that has none, and of a share of GPUs that
+    cannot be assigned."""
     problems = []
     if _value(values, "compute.engine") != "ray":
         problems = [
@@ -251,7 +260,7 @@ def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Probl
                 f"{show(values[name])} needs compute.engine = ray, but the engine is {values['compute.engine']}",
                 suggestion=FIELDS[name].default,
             )
-            for name in ("compute.address", f"{RESOURCES}cpu", f"{RESOURCES}gpu")
+            for name in ("compute.address", f"{RESOURCES}cpu")
             if _value(values, name) not in (FIELDS[name].default, *([1] if name == f"{RESOURCES}cpu" else []))
         ]
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"

@@ -1,8 +1,9 @@
 """The inline engine: workers are child processes of this process, or threads of one child, connected by sockets.
 
-Children are started by exec with fixed settings (one XLA thread, CPU) and never forked, so the caller's use of JAX has
-no effect on them. For the same reason, workers are never threads of this process. The engine itself has no threads
-either: it polls the sockets, so a child that stops in the middle of a message or does not read cannot block it.
+Children are started by exec with fixed settings (one XLA thread; the CPU, or a GPU) and never forked, so the caller's
+use of JAX has no effect on them. For the same reason, workers are never threads of this process. The engine itself has
+no threads either: it polls the sockets, so a child that stops in the middle of a message or does not read cannot block
+it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import IO
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.gpus import places
 from es_service.errors import Interrupted
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
@@ -47,6 +49,7 @@ def inline_engine(
     should_stop: Callable[[], int | None] = lambda: None,
     *,
     threads: bool = False,
+    gpus: float = 0.0,
     log: Log = no_log,
     on_compile: Callable[[str], None] = lambda kind: None,
 ) -> Engine[ChildProcesses]:
@@ -57,9 +60,10 @@ def inline_engine(
         limits: number of workers, deadlines and numbers of attempts.
         should_stop: as in `Engine`.
         threads: whether workers are threads of one child, which takes less memory; if one is lost, all are lost.
+        gpus: GPUs of each worker, or the share of one. There must be room for `limits.workers`, see `gpus.places`.
         log, on_compile: as in `Engine`.
     """
-    return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log, on_compile=on_compile)
+    return Engine(ChildProcesses(spec, threads=threads, gpus=gpus), limits, should_stop, log, on_compile=on_compile)
 
 
 @dataclass(eq=False)
@@ -71,6 +75,8 @@ class _Child:
     """File with the child's output on stdout and stderr."""
     control: socket.socket
     """Socket over which the child receives the sockets of its workers."""
+    place: str
+    """The GPUs that it may use, as CUDA_VISIBLE_DEVICES names them."""
 
 
 @dataclass(eq=False)
@@ -92,8 +98,10 @@ class _Worker:
 class ChildProcesses:
     """Transport whose workers are child processes, or threads of one child process."""
 
-    def __init__(self, spec: WorkerSpec, *, threads: bool = False) -> None:
+    def __init__(self, spec: WorkerSpec, *, threads: bool = False, gpus: float = 0.0) -> None:
         self._spec, self._threads = framed(spec), threads
+        self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
+        self._platforms: set[str] = set()
         self._parent_cache_bytes = spec.parent_cache_bytes
         self._workers: dict[int, _Worker] = {}
         self._by_descriptor: dict[int, int] = {}
@@ -111,7 +119,7 @@ class ChildProcesses:
             try:
                 ours, theirs = map(undo.enter_context, _socket_pair())
                 running = next(iter(self._workers.values()), None) if self._threads else None
-                child = running.child if running is not None else _start_child(self._spec, undo)
+                child = running.child if running is not None else self._start_child(undo)
                 socket.send_fds(child.control, [b"w"], [theirs.fileno()])
             except OSError as error:  # no more processes, file descriptors or disk space, or the child has just ended
                 self._ready.append(WorkerLost(worker, f"worker {worker} cannot be started: {error}"))
@@ -151,8 +159,8 @@ class ChildProcesses:
         self._watch(to.channel)
 
     def platforms(self) -> frozenset[str]:
-        """Empty, since children share this machine and its packages."""
-        return frozenset()
+        """Empty, since children share this machine and its packages, unless they use GPUs, whose kind they name."""
+        return frozenset(self._platforms)
 
     def silent(self) -> tuple[int, ...]:
         """Empty, since sockets show at once that a child is gone."""
@@ -183,6 +191,12 @@ class ChildProcesses:
             _kill(worker.child)  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
+
+    def _start_child(self, undo: ExitStack) -> _Child:
+        """A new process, which gets the place at the GPUs that has the fewest workers."""
+        taken = [worker.child.place for worker in self._workers.values()]
+        free = min(self._places, key=lambda place: taken.count(place) / self._places.count(place), default="")
+        return _start_child(self._spec, undo, self._gpus, free)
 
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
         """A new number for a subject, and the message with both."""
@@ -217,7 +231,8 @@ class ChildProcesses:
             messages, is_open = worker.channel.receive()
             for said in messages:
                 match said:
-                    case ("up",):
+                    case ("up", platform):
+                        self._platforms |= {platform} - {""}
                         self._ready.append(WorkerUp(number))
                     case ("compiled", kind, seconds):
                         self._ready.append(Compiled(number, kind, seconds))
@@ -294,7 +309,7 @@ def _kill(child: _Child) -> None:
     child.process.kill()
 
 
-def _start_child(spec: bytes, undo: ExitStack) -> _Child:
+def _start_child(spec: bytes, undo: ExitStack, gpus: float, place: str) -> _Child:
     """A new process that has been sent the constants of the run; closing `undo` ends it."""
     undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
     ours, theirs = _socket_pair()
@@ -303,7 +318,7 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
         process = start_child(
             lambda: subprocess.Popen(
                 [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-                env=child_environment(),
+                env=child_environment(gpus, place),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -315,7 +330,7 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     undo.callback(process.kill)
     ours.sendall(spec)
     ours.setblocking(False)  # if the child does not take its workers' sockets, they cannot be started
-    return _Child(process, log, ours)
+    return _Child(process, log, ours, place)
 
 
 def _socket_pair() -> tuple[socket.socket, socket.socket]:

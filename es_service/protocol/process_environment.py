@@ -44,6 +44,11 @@ def same_imports() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path), "PYTHONSAFEPATH": "1"}
 
 
-def child_environment() -> dict[str, str]:
-    """Environment variables of a worker process without a GPU, which imports from the same places as this process."""
-    return worker_environment(os.environ) | same_imports()
+def child_environment(gpus: float = 0.0, place: str = "") -> dict[str, str]:
+    """Environment variables of a worker process, which imports from the same places as this process.
+
+    Args:
+        gpus: as for `worker_environment`.
+        place: what CUDA_VISIBLE_DEVICES must be, with GPUs.
+    """
+    return worker_environment({**os.environ, "CUDA_VISIBLE_DEVICES": place}, gpus) | same_imports()

@@ -15,7 +15,6 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.dispatch_log import no_log
@@ -27,10 +26,11 @@ from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
 from es_service.runs.compiling import compiling_sentence, noting
-from es_service.runs.session import dispatch_limits, require_cores
+from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.snapshot import Policy, make_policy
 from es_service.runs.view import Run, is_light, is_no_elite
+from es_service.runs.worker_count import on_this_machine, require_cores
 from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
@@ -158,8 +158,8 @@ def evaluation_config(run: Run, workers: int | None = None) -> RunConfig:
 
     Raises ConfigError if these are too many for its cores, or if the run's own config cannot be read.
     """
-    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
-    config = changed_config(run.present_config, overrides)
+    stored = run.present_config
+    config = changed_config(stored, on_this_machine(stored, workers))
     require_cores(config)
     return config
 
@@ -223,6 +223,7 @@ def workers_of(
             spec,
             dispatch_limits(config, chunks),
             should_stop,
+            gpus=config.compute.worker_resources.gpu,
             log=noting(no_log, spec),
             on_compile=tell_compiling,
         ) as engine,

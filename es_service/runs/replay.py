@@ -34,6 +34,7 @@ from es_service.runs.checked_config import changed_config
 from es_service.runs.evaluation import Candidate, candidates
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.view import Run
+from es_service.runs.worker_count import GPU
 from es_service.store import reader
 
 CERTIFIED = "certified"
@@ -90,7 +91,7 @@ def record(
         NotInRunError: a cell does not exist or is empty, or the run has no finished generation, or no certified policy.
             ConfigError: the task cannot be used on this machine. EvaluationError: the recording failed.
     """
-    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"}
+    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], GPU: 0, "compute.workers": "auto"}
     config = changed_config(run.present_config, overrides)
     chosen = candidates(run, best=best, centre=False, cells=cells, every=False)
     now = {**platform_info(), CODE: code_of(config)}

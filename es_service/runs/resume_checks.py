@@ -18,8 +18,8 @@ from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changes_from
 from es_service.runs.identity import require_unchanged
 from es_service.runs.run_status import RunStatus, read_status
-from es_service.runs.session import require_cores
 from es_service.runs.view import open_run
+from es_service.runs.worker_count import require_cores
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore

@@ -11,17 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from es_service.config.changes import again_with
-from es_service.config.compute import implied_by
 from es_service.config.model import RunConfig, policy_spec, worker_spec
-from es_service.config.parallel import chunks_at_once, parallel_sentence
+from es_service.config.parallel import parallel_sentence
 from es_service.config.tasks import task_of
-from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import ConfigError, EvaluationError, Interrupted, StoreError, WayOut
+from es_service.errors import EvaluationError, Interrupted, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
@@ -32,6 +29,7 @@ from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
+from es_service.runs.worker_count import work_at_once, worker_count
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import SEVERAL
@@ -267,7 +265,8 @@ def make_engine(
     limits = dispatch_limits(config, most)
     if compute.engine == "inline":
         threads = compute.inline_workers == "threads"
-        engine = inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
+        gpus = compute.worker_resources.gpu
+        engine = inline_engine(spec, limits, should_stop, threads=threads, gpus=gpus, log=log, on_compile=on_compile)
         return _describing(engine, config, spec)
     from es_service.dispatch.ray_engine import ray_engine
 
@@ -329,59 +328,3 @@ def initial_policy(config: RunConfig, centre: int) -> FloatArray:
     if (parameters := task_of(config).parameters) is not None:
         return parameters.first(config.seed, centre)
     return initial_parameters(policy_spec(config, task_of(config)), config.policy.init, config.seed, centre)
-
-
-def worker_count(config: RunConfig, most: int | None = None) -> int:
-    """Number of workers, as configured or one per core that this process may use: for the engine inline as far as there
-    is work for them, which the engine ray sees to itself, since it depends on the cores of each actor.
-
-    Args:
-        most: number of workers for which there is work; None: as in a generation of a run.
-
-    Raises ConfigError as `require_cores`.
-    """
-    require_cores(config)
-    workers = cores() if config.compute.workers == "auto" else config.compute.workers
-    if config.compute.engine == "ray":
-        return workers
-    return min(workers, max(1, work_at_once(config) if most is None else most))
-
-
-def work_at_once(config: RunConfig) -> int:
-    """Number of workers for which a generation of a run has work. A search of the user's own may ask for any number of
-    policies, so as many as are configured have work."""
-    workers = config.compute.workers
-    return workers if ":" in config.search.algorithm and workers != "auto" else chunks_at_once(config)
-
-
-def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
-    """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run.
-
-    Args:
-        again: the call that asks for the workers, which ways out repeat with other settings.
-    """
-    compute, count = config.compute, cores()
-    if compute.workers == "auto" or compute.address is not None:
-        return
-    allowed = compute.max_workers_per_core * count
-    if compute.workers <= allowed:
-        return
-    here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
-    cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
-    ways_out = (
-        []
-        if again is None
-        else [
-            again_with(again, "start one worker for each core", {"compute.workers": "auto"}),
-            again_with(again, "use the cores of a Ray cluster", cluster),
-        ]
-    )
-    raise ConfigError(
-        f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
-        f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",
-        field="compute.workers",
-        value=compute.workers,
-        allowed=f"at most {allowed}",
-        suggestion="auto",
-        ways_out=ways_out,
-    )

@@ -21,8 +21,9 @@ from es_service.runs import targets
 from es_service.runs.certified import target_reached
 from es_service.runs.checked_config import accepted
 from es_service.runs.resume_checks import columns, require_resumable
-from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, require_cores, work
+from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, work
 from es_service.runs.view import open_run
+from es_service.runs.worker_count import require_cores
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
 from es_service.store.folder import CONFIG, explained, write_config

@@ -12,7 +12,7 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.ray_cluster import nodes_of_cluster
 from es_service.dispatch.ray_nodes import actor_cores, with_work
 from es_service.errors import ConfigError
-from es_service.runs.session import require_cores
+from es_service.runs.worker_count import require_cores
 
 
 @dataclass(frozen=True)

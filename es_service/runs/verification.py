@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import BudgetConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
@@ -26,6 +25,7 @@ from es_service.runs.identity import changes_since, code_of
 from es_service.runs.session import dispatch_limits, initial_centres, initial_statistics
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run
+from es_service.runs.worker_count import on_this_machine
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
 from es_service.store.codec import (
@@ -76,8 +76,8 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
 
 
 def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recomputed]:
-    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
-    config = changed_config(run.present_config, overrides)
+    stored = run.present_config
+    config = changed_config(stored, on_this_machine(stored, workers))
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
     plan = _plan(run, generations)
     budget = BudgetConfig.model_validate({"generations": (run.generation or 0) + 1})  # not spent before the plan is
@@ -90,7 +90,9 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
     )
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task), dispatch_limits(config), should_stop) as engine,
+        inline_engine(
+            worker_spec(config, task), dispatch_limits(config), should_stop, gpus=config.compute.worker_resources.gpu
+        ) as engine,
     ):
         for begin, last in plan:
             reached, differences = _recompute(run, search, engine, begin, last)

@@ -13,7 +13,7 @@ import numpy as np
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.protocol.policy_spec import Activation, PolicySpec
-from workers.policies.recurrent import dense, next_memory
+from workers.policies.recurrent import Dense, dense, next_memory
 
 INITIAL_COLUMN_NORMS = {"unit_columns": (1.0, 0.01), "small_columns": (0.01, 0.01)}
 """(column norm of hidden layers, column norm of the output layer) for each value of `policy.init`.
@@ -41,12 +41,15 @@ def initial_memory(xp: Any, spec: PolicySpec, *axes: int) -> Any:
     return xp.zeros((*axes, spec.memory), np.float32) if spec.memory else None
 
 
-def act(xp: Any, spec: PolicySpec, layers: Layers, memory_H: Any, observation_O: Any) -> tuple[Any, Any]:
+def act(
+    xp: Any, spec: PolicySpec, layers: Layers, memory_H: Any, observation_O: Any, dense: Dense = dense
+) -> tuple[Any, Any]:
     """What one step of a policy computes.
 
     Args:
         memory_H: the memory before the step; None for a policy without one.
         observation_O: a normalised observation.
+        dense: what computes a layer before its activation.
 
     Returns:
         (outputs of the last layer, of which `workers.policies.outputs` makes an action; the memory after the step)
@@ -57,7 +60,7 @@ def act(xp: Any, spec: PolicySpec, layers: Layers, memory_H: Any, observation_O:
         x = activated(xp, spec.activation, dense(x, weights, biases))
     if spec.memory:
         gates, candidate = layers[len(hidden) : -1]
-        memory_H = x = next_memory(xp, gates, candidate, memory_H, x)
+        memory_H = x = next_memory(xp, gates, candidate, memory_H, x, dense)
     x = dense(x, *layers[-1])
     return xp.tanh(x) if spec.output == "tanh" else x, memory_H
 

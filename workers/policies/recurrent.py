@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,13 @@ def dense(x: Any, weights: Any, biases: Any) -> Any:
     return x @ weights if biases is None else x @ weights + biases
 
 
-def next_memory(xp: Any, gates: tuple[Any, Any], candidate: tuple[Any, Any], memory_H: Any, x: Any) -> Any:
+Dense = Callable[[Any, Any, Any], Any]
+"""Function (x, weights, biases or None) -> outputs of a layer before its activation."""
+
+
+def next_memory(
+    xp: Any, gates: tuple[Any, Any], candidate: tuple[Any, Any], memory_H: Any, x: Any, dense: Dense = dense
+) -> Any:
     """Memory after a step, between the memory before it and a candidate, as far as the gates say.
 
         reset, keep = sigmoid(gates [x, memory])
@@ -24,6 +31,7 @@ def next_memory(xp: Any, gates: tuple[Any, Any], candidate: tuple[Any, Any], mem
         candidate: (weights [in + H, H], biases [H] or None).
         memory_H: [..., H].
         x: input of the cell, [..., in].
+        dense: what computes a layer before its activation.
 
     Source: the gated recurrent unit of Cho et al. 2014 (arXiv:1406.1078), with the reset before the product.
     """

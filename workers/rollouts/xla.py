@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
@@ -27,10 +28,14 @@ class Xla(RolloutBackend):
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.rollout`."""
         from workers import rollout
+        from workers.scatters import without_scatters
 
         environment = environments.make_environment(spec.environment, spec.environment_options)
+        if on_gpu := _on_gpu():
+            reset, step = without_scatters(environment.reset), without_scatters(environment.step)
+            environment = replace(environment, reset=reset, step=step)
         return ChunkFunctions(
-            rollout.make_training_rollout(environment, spec),
+            rollout.make_training_rollout(environment, spec, in_pairs=on_gpu),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
             rollout.make_gradient_sum(spec.policy.parameters),
@@ -52,3 +57,10 @@ class Xla(RolloutBackend):
         from workers.rollouts.jax_tasks import random_steps
 
         return random_steps(lambda episode, *_: jax.jit(jax.vmap(episode)), task, options, batch, steps)
+
+
+def _on_gpu() -> bool:
+    """Whether JAX computes on a GPU."""
+    import jax
+
+    return jax.default_backend() == "gpu"

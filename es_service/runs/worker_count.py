@@ -1,0 +1,119 @@
+"""How many workers a run starts, by what this machine has: one for each core, or one for each place at its GPUs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from es_service.config.changes import again_with
+from es_service.config.compute import ENGINE_IMPLIES, implied_by
+from es_service.config.fields import RESOURCES
+from es_service.config.model import RunConfig
+from es_service.config.parallel import chunks_at_once
+from es_service.dispatch.cores import cores
+from es_service.dispatch.gpus import places
+from es_service.errors import ConfigError, WayOut
+
+GPU = f"{RESOURCES}gpu"
+
+
+def worker_count(config: RunConfig, most: int | None = None) -> int:
+    """Number of workers, as configured or one per core that this process may use, or one for each place at its GPUs:
+    for the engine inline as far as there is work for them, which the engine ray sees to itself, since it depends on the
+    cores of each actor.
+
+    Args:
+        most: number of workers for which there is work; None: as in a generation of a run.
+
+    Raises ConfigError as `require_cores`.
+    """
+    require_cores(config)
+    compute = config.compute
+    at_gpus = compute.worker_resources.gpu > 0 and compute.engine == "inline"
+    auto = _gpu_places(config) if at_gpus else cores()
+    workers = auto if compute.workers == "auto" else compute.workers
+    if compute.engine == "ray":
+        return workers
+    return min(workers, max(1, work_at_once(config) if most is None else most))
+
+
+def work_at_once(config: RunConfig) -> int:
+    """Number of workers for which a generation of a run has work. A search of the user's own may ask for any number of
+    policies, so as many as are configured have work."""
+    workers = config.compute.workers
+    return workers if ":" in config.search.algorithm and workers != "auto" else chunks_at_once(config)
+
+
+def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
+    """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run, or than its
+    GPUs have room for.
+
+    Args:
+        again: the call that asks for the workers, which ways out repeat with other settings.
+    """
+    compute, count = config.compute, cores()
+    if compute.engine == "inline" and compute.worker_resources.gpu:
+        _require_gpus(config)
+    if compute.workers == "auto" or compute.address is not None:
+        return
+    allowed = compute.max_workers_per_core * count
+    if compute.workers <= allowed:
+        return
+    here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
+    cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
+    ways_out = (
+        []
+        if again is None
+        else [
+            again_with(again, "start one worker for each core", {"compute.workers": "auto"}),
+            again_with(again, "use the cores of a Ray cluster", cluster),
+        ]
+    )
+    raise ConfigError(
+        f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
+        f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",
+        field="compute.workers",
+        value=compute.workers,
+        allowed=f"at most {allowed}",
+        suggestion="auto",
+        ways_out=ways_out,
+    )
+
+
+def _gpu_places(config: RunConfig) -> int:
+    """Number of workers for which this machine's GPUs have room."""
+    return len(places(os.environ, config.compute.worker_resources.gpu))
+
+
+def _require_gpus(config: RunConfig) -> None:
+    room, asked = _gpu_places(config), config.compute.workers
+    if not room:
+        raise ConfigError(
+            f"{GPU}: each worker is to have {config.compute.worker_resources.gpu:g}, but this machine has too few "
+            "NVIDIA GPUs, or CUDA_VISIBLE_DEVICES hides them; 0 computes episodes on the CPU",
+            field=GPU,
+            value=config.compute.worker_resources.gpu,
+            suggestion=0,
+        )
+    if asked != "auto" and asked > room:
+        raise ConfigError(
+            f"compute.workers: {asked} workers are too many for this machine, whose GPUs have room for {room}",
+            field="compute.workers",
+            value=asked,
+            allowed=f"at most {room}",
+            suggestion="auto",
+        )
+
+
+def on_this_machine(config: Mapping[str, Any], workers: int | None = None) -> dict[str, Any]:
+    """Settings with which a run's episodes are computed on this machine, where others have perhaps computed them: on
+    GPUs as the run's own if there is room for a worker, else on the CPU.
+
+    Args:
+        config: that of the run.
+        workers: number of workers; None: as many as there are cores, or places at the GPUs.
+    """
+    gpus = config["compute"].get("worker_resources", {}).get("gpu", 0)
+    here = gpus if gpus and places(os.environ, gpus) else 0
+    return {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], GPU: here, "compute.workers": workers or "auto"}

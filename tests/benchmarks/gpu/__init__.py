@@ -1,0 +1,1 @@
+"""Measurements on one GPU; see `__main__.py`."""
