@@ -1,9 +1,9 @@
-"""Functions of JAX without scatters that add, for GPUs.
+"""Functions of JAX with sums in place of scatters that add, for GPUs.
 
 With deterministic operations, XLA sorts what such a scatter adds, which takes most of the time of a step of Brax. It
 also adds to another environment of the batch what JAX's index -1 should have dropped (seen with jaxlib 0.11.2 on an
 H200): ants had forces of their neighbours. A sum over all updates, of which those of other rows count as 0, needs no
-order and drops what it should.
+order and drops what it should. Other scatters get a place for what is dropped.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal
+from jax.lax import GatherScatterMode
 
 CALLS = ("jit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat2")
 """Primitives that only call a function."""
@@ -21,7 +22,8 @@ CALLS = ("jit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"
 
 def without_scatters(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with every scatter that adds whole rows, such as `segment_sum` and `x.at[index].add(row)`, as a sum
-    of all rows; other scatters stay. The order of additions is XLA's, and so may be other bits."""
+    of all rows; other scatters stay, with indices inside of what they change. The order of additions is XLA's, and so
+    may be other bits."""
 
     def dense(*arguments: Any) -> Any:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
@@ -52,6 +54,8 @@ def _outputs(equation: Any, inputs: list[Any]) -> Sequence[Any]:
     if name in CALLS:
         inner = params.get("jaxpr", params.get("call_jaxpr"))
         return _evaluated(inner if hasattr(inner, "consts") else ClosedJaxpr(inner, ()), inputs)
+    if name.startswith("scatter") and _drops(params):
+        return [_with_a_place_for_the_dropped(equation, *inputs)]
     inner = {name: _without(value) for name, value in params.items() if _has_jaxprs(value)}  # of a loop or a branch
     found = equation.primitive.bind(*inputs, **params | inner)
     return found if equation.primitive.multiple_results else [found]
@@ -86,3 +90,21 @@ def _sum_of_rows(operand: Any, indices: Any, updates: Any) -> Any:
     is_row_N_K = indices[None, :, 0] == jnp.arange(operand.shape[0], dtype=indices.dtype)[:, None]
     is_row = is_row_N_K.reshape(*is_row_N_K.shape, *[1] * (operand.ndim - 1))
     return operand + jnp.where(is_row, updates[None], jnp.zeros((), updates.dtype)).sum(axis=1)
+
+
+def _drops(params: dict[str, Any]) -> bool:
+    """Whether a scatter drops updates by their indices, which name single places along their axes."""
+    numbers = params["dimension_numbers"]
+    inserted = set(numbers.inserted_window_dims)
+    drops = params["mode"] == GatherScatterMode.FILL_OR_DROP
+    return drops and set(numbers.scatter_dims_to_operand_dims) <= inserted and not numbers.operand_batching_dims
+
+
+def _with_a_place_for_the_dropped(equation: Any, operand: Any, indices: Any, updates: Any) -> Any:
+    """The scatter into an operand that is longer by one along each axis of the indices, where the dropped ones go."""
+    axes = equation.params["dimension_numbers"].scatter_dims_to_operand_dims
+    sizes = jnp.asarray([operand.shape[axis] for axis in axes], indices.dtype)
+    is_kept = ((indices >= 0) & (indices < sizes)).all(axis=-1, keepdims=True)
+    longer = jnp.pad(operand, [(0, int(axis in axes)) for axis in range(operand.ndim)])
+    found = equation.primitive.bind(longer, jnp.where(is_kept, indices, sizes), updates, **equation.params)
+    return found[tuple(slice(size) for size in operand.shape)]

@@ -75,7 +75,7 @@ class _Child:
     """File with the child's output on stdout and stderr."""
     control: socket.socket
     """Socket over which the child receives the sockets of its workers."""
-    place: str
+    place: str = ""
     """The GPUs that it may use, as CUDA_VISIBLE_DEVICES names them."""
 
 

@@ -12,7 +12,7 @@ from tests.es_service.config_examples import MINIMAL, load
 def test_options_win_over_the_file_and_over_set():
     file = MINIMAL | {"compute": {"engine": "ray", "address": "head:6379", "worker_resources": {"gpu": 0.5}}}
     compute = load(file, *cli_options.overrides(["compute.workers=3"], seed=4, workers=2, engine="inline")).compute
-    assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.0, 2)
+    assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.5, 2)
     compute = load(MINIMAL | {"compute": {"engine": "inline"}}, *cli_options.overrides(None, address="auto")).compute
     assert (compute.engine, compute.address) == ("ray", "auto")
     threads = MINIMAL | {"compute": {"engine": "inline", "inline_workers": "threads"}}
@@ -27,7 +27,7 @@ def test_what_options_imply_does_not_silence_set():
             cli_options.overrides(["compute.address=h:1"], engine="inline"),
             "compute.address: h:1 needs compute.engine = ray",
         ),
-        (cli_options.overrides(["compute.worker_resources.gpu=1"], engine="inline"), "worker_resources.gpu: 1 needs"),
+        (cli_options.overrides(["compute.worker_resources.cpu=4"], engine="inline"), "worker_resources.cpu: 4 needs"),
         (
             cli_options.overrides(["compute.engine=inline"], address="h:1"),
             "compute.address: h:1 needs compute.engine = ray",

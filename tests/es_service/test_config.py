@@ -135,8 +135,9 @@ def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
 
 def test_the_engine_is_ray_where_something_needs_it():
     assert load().compute.engine == "inline"
-    for needs in ("compute.address=auto", "compute.worker_resources.gpu=1", "compute.worker_resources.cpu=4"):
+    for needs in ("compute.address=auto", "compute.worker_resources.cpu=4"):
         assert load(MINIMAL, needs).compute.engine == "ray", needs
+    assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.engine == "inline"
     with pytest.raises(ConfigError, match=r"compute.address: auto needs compute.engine = ray"):
         load(MINIMAL, "compute.address=auto", "compute.engine=inline")
 
@@ -145,6 +146,14 @@ def test_workers_are_whole_actors():
     assert load(MINIMAL, "compute.worker_resources.cpu=4", "compute.workers=8").compute.workers == 8
     with pytest.raises(ConfigError, match=r"workers: 6 is not a multiple of compute.worker_resources.cpu \(4\)"):
         load(MINIMAL, "compute.worker_resources.cpu=4", "compute.workers=6")
+
+
+def test_on_a_gpu_all_pairs_step_together_as_far_as_their_weights_fit():
+    wide = MINIMAL | {"policy": {"hidden": [256, 256]}}
+    for pairs, chunk in ((64, 64), (4096, 4096), (6000, 3000)):
+        sizes = load(wide, f"search.pairs={pairs}", "compute.worker_resources.gpu=1").compute
+        assert (sizes.chunk_pairs, sizes.rollout_block_pairs) == (chunk, chunk)
+    assert default_rollout_block_pairs(4096, 1_000_000, gpu=True) == 1024, "8 bytes of 1,000,000 weights in 8 GiB"
 
 
 def test_simd_is_what_auto_chooses_where_it_can_be_had():

@@ -152,11 +152,9 @@ def test_a_run_to_start_from_in_a_folder_that_may_not_be_looked_into(tmp_path):
     assert "cannot be accessed (Permission denied); must be the folder of another run, or null" in line
 
 
-def test_a_cluster_or_a_gpu_without_ray_is_refused():
-    asked = ("compute.engine=inline", "compute.address=auto", "compute.worker_resources.gpu=0.5")
-    assert problems(MINIMAL, *asked) == [
+def test_a_cluster_without_ray_is_refused():
+    assert problems(MINIMAL, "compute.engine=inline", "compute.address=auto") == [
         "compute.address: auto needs compute.engine = ray, but the engine is inline",
-        "compute.worker_resources.gpu: 0.5 needs compute.engine = ray, but the engine is inline",
     ]
 
 

@@ -9,7 +9,7 @@ import pytest
 from es_service.api import load_config
 from es_service.cli import bench_rollouts, doctor
 from es_service.dispatch import cores
-from es_service.runs import session
+from es_service.runs.worker_count import worker_count
 
 SMALLEST = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
 
@@ -100,7 +100,7 @@ def test_the_least_quota_of_the_groups_around_a_process_limits_the_cores(write, 
 
 def test_whoever_counts_cores_knows_of_the_quota(write, monkeypatch):
     write({"cpu.max": "300000 100000\n"})
-    assert session.worker_count(load_config(SMALLEST)) == 3
+    assert worker_count(load_config(SMALLEST)) == 3
     assert next(doctor._machine())[1].startswith("3 of ")
     asked = []
     monkeypatch.setattr(bench_rollouts, "_row", lambda arguments, count: asked.append(count) or {})

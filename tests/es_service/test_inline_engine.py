@@ -177,11 +177,11 @@ def test_a_child_has_its_place_before_it_comes_up():
 
 def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):
     transport, (end, other) = transport
-    end.sendall(framed(("up",))[:-2])
+    end.sendall(framed(("up", ""))[:-2])
     started = time.monotonic()
     assert transport.receive(0.0) is None
     assert time.monotonic() - started < 5.0
-    other.sendall(framed(("up",)))
+    other.sendall(framed(("up", "")))
     assert transport.receive(1.0) == WorkerUp(1)
 
 
@@ -248,7 +248,7 @@ def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, m
         raise Interrupted(signal.SIGINT)
 
     transport, ends = transport
-    ends[1].sendall(framed(("up",)))
+    ends[1].sendall(framed(("up", "")))
     monkeypatch.setattr(inline_module.Channel, "receive", interrupt)
     with pytest.raises(Interrupted):
         transport.receive(1.0)

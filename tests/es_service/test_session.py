@@ -26,8 +26,9 @@ from es_service.dispatch.events import (
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.errors import ConfigError, StoreError
-from es_service.runs import session
-from es_service.runs.session import dispatch_limits, initial_centres, worker_count
+from es_service.runs import worker_count as counting
+from es_service.runs.session import dispatch_limits, initial_centres
+from es_service.runs.worker_count import on_this_machine, worker_count
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -96,7 +97,7 @@ def configured(workers: int, **compute: object):
 
 def test_no_more_workers_start_than_have_work(monkeypatch):
     """Except for a search of the user's own, which may ask for any number of policies."""
-    monkeypatch.setattr(session, "cores", lambda: 16)
+    monkeypatch.setattr(counting, "cores", lambda: 16)
     config = configured(40)
     chunks = chunks_at_once(config)
     assert chunks < 40
@@ -140,7 +141,7 @@ def test_the_largest_phase_of_a_generation_says_how_many_workers_have_work(setti
 @pytest.mark.parametrize("engine", ["inline", "ray"])
 def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_refused(engine, monkeypatch, tmp_path):
     """Before anything is written: the way out of a refused resume is not refused again."""
-    monkeypatch.setattr(session, "cores", lambda: 2)
+    monkeypatch.setattr(counting, "cores", lambda: 2)
     assert worker_count(configured(8, engine=engine), 9) == 8
     assert worker_count(configured(20, engine=engine, max_workers_per_core=10), 1000) == 20
     assert worker_count(configured(5000, engine="ray", address="auto"), 1000) == 5000
@@ -148,6 +149,7 @@ def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_ref
     with pytest.raises(ConfigError, match=r"5000 workers are too many for this machine, which has 2 cores") as error:
         api.run(configured(5000, engine=engine), folder)
     assert (error.value.field, error.value.value, error.value.allowed) == ("compute.workers", 5000, "at most 8")
+
     again = f"es-service run CONFIG --out {folder}"
     assert error_message(error.value).splitlines()[1:] == [
         f"  to start one worker for each core: {again} --set compute.workers=auto",
@@ -161,3 +163,23 @@ def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_ref
     assert f" resume {folder} --engine {engine} --set compute.workers=auto\n" in error_message(error.value)
     assert error_message(error.value).endswith(f" resume {folder} --address HOST:PORT --set compute.workers=9")
     assert (folder / "config.yaml").read_text() == before
+
+
+def test_workers_without_ray_are_as_many_as_the_gpus_have_room_for(monkeypatch):
+    def on_gpus(share, workers="auto"):
+        return load_config(CONFIG, {"compute.worker_resources.gpu": share, "compute.workers": workers})
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    assert [worker_count(on_gpus(share), 9) for share in (2, 1, 0.5)] == [1, 2, 4]
+    assert worker_count(on_gpus(0.5, workers=3), 9) == 3
+    with pytest.raises(ConfigError, match="3 workers are too many for this machine, whose GPUs have room for 2"):
+        worker_count(on_gpus(1, workers=3))
+    with pytest.raises(ConfigError, match=r"gpu: each worker is to have 3, but this machine has too few NVIDIA GPUs"):
+        worker_count(on_gpus(3))
+
+
+def test_episodes_of_a_run_on_gpus_are_computed_on_the_cpu_where_there_is_none(monkeypatch):
+    config = load_config(CONFIG, {"compute.worker_resources.gpu": 1}).model_dump(mode="json")
+    for visible, gpus in (("0", 1), ("", 0)):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+        assert on_this_machine(config)["compute.worker_resources.gpu"] == gpus
