@@ -65,7 +65,7 @@ def measure(task: str, pairs: int, sigma: float) -> dict[str, float]:
     environment, target, places = make_environment(task, {}), host_target(), []
 
     def load(code: bytes, target: Target) -> tuple[int, object]:
-        jit = llvm.create_lljit_compiler(machine_code._machine(target), use_jit_link=True, suppress_errors=True)
+        jit = llvm.create_lljit_compiler(machine_code.code_generator(target), use_jit_link=True, suppress_errors=True)
         library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol("kernel").export_symbol("counts")
         linked = library.link(jit, "kernels")
         places.append(ctypes.CFUNCTYPE(ctypes.c_void_p)(linked["counts"])())

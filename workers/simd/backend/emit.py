@@ -7,7 +7,7 @@ LLVM assigns all others to registers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.target import Target
@@ -45,7 +45,13 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, target: Target) -> s
 
 @refusing()
 def graph_function(
-    name: str, graph: Graph, outputs: Sequence[int], sources: Sequence[tuple[str, int]], out: str, target: Target
+    name: str,
+    graph: Graph,
+    outputs: Sequence[int],
+    sources: Sequence[tuple[str, int]],
+    out: str,
+    target: Target,
+    apart: Collection[str] = (),
 ) -> FunctionBuilder:
     """Function `void name(ptr ...)` that computes a graph from words in memory.
 
@@ -53,22 +59,25 @@ def graph_function(
         sources: (pointer, number of words read there), in the order of the graph's inputs. A pointer may occur twice.
         out: pointer to the words of `outputs`. If it is a source as well, they overwrite the words read there; all
             words are read before any is written.
+        apart: pointers whose words are not neighbours but `%lanes` words apart, as in [word, lane]. If there are any,
+            `i64 %lanes` is the function's last parameter.
 
     Raises:
         UnsupportedError: more values are needed at the same time, or carried by loops, than fit on the stack.
     """
     pointers = list(dict.fromkeys([*(pointer for pointer, _ in sources), out]))
-    builder = FunctionBuilder(name, [f"ptr noalias %{pointer}" for pointer in pointers], target)
+    parameters = [*(f"ptr noalias %{pointer}" for pointer in pointers), *["i64 %lanes"] * bool(apart)]
+    builder = FunctionBuilder(name, parameters, target)
     input_addresses: list[tuple[str, int]] = []
     used = dict.fromkeys(pointers, 0)
     for pointer, words in sources:
         input_addresses += [(f"%{pointer}", used[pointer] + word) for word in range(words)]
         used[pointer] += words
-    writer = _Writer(builder, graph, outputs, input_addresses)
+    writer = _Writer(builder, graph, outputs, input_addresses, [f"%{pointer}" for pointer in apart])
     writer.compute_all()
     stored = [writer.in_memory(node) for node in outputs]
     for word, (llvm_type, value) in enumerate(stored):
-        builder.store(llvm_type, value, f"%{out}", word)
+        builder.store(llvm_type, value, f"%{out}", writer.place(f"%{out}", word))
     if (live := builder.most_live()) > MOST_LIVE:
         raise UnsupportedError(f"{live:,} values are needed at the same time; simd supports at most {MOST_LIVE:,}")
     return builder
@@ -89,9 +98,14 @@ class _Writer:
     """Writer of a graph's instructions into a function."""
 
     def __init__(
-        self, builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], input_addresses: Sequence[tuple[str, int]]
+        self,
+        builder: FunctionBuilder,
+        graph: Graph,
+        outputs: Sequence[int],
+        input_addresses: Sequence[tuple[str, int]],
+        apart: Collection[str] = (),
     ) -> None:
-        self.builder, self.graph = builder, graph
+        self.builder, self.graph, self.apart = builder, graph, apart
         self.input_addresses = input_addresses
         """(pointer, word) of each input of the graph."""
         self.words = {dtype.upper(): llvm_type for dtype, llvm_type in builder.llvm_types.items()}
@@ -181,9 +195,13 @@ class _Writer:
         if key[0] == "const":
             return self.constant(key[1], key[2])
         if node not in self.values:
-            pointer, index = self.input_addresses[key[2]] if key[0] == "input" else (self.memory, self.slots[node])
-            self.values[node] = self.load(self.graph.dtypes[node], pointer, index)
+            pointer, word = self.input_addresses[key[2]] if key[0] == "input" else (self.memory, self.slots[node])
+            self.values[node] = self.load(self.graph.dtypes[node], pointer, self.place(pointer, word))
         return self.values[node]
+
+    def place(self, pointer: str, word: int) -> str | int:
+        """Index of a word in the memory of a pointer."""
+        return self.builder.index(("%lanes", word)) if pointer in self.apart else word
 
     def constant(self, dtype: str, bits: int) -> str:
         """LLVM constant with the same number in all lanes."""
@@ -192,7 +210,7 @@ class _Writer:
             return f"splat (float 0x{struct.pack('>d', number).hex().upper()})"
         return f"splat (i32 {bits})" if dtype == "i" else f"splat (i1 {str(bool(bits)).lower()})"
 
-    def load(self, dtype: str, pointer: str, index: int) -> str:
+    def load(self, dtype: str, pointer: str, index: str | int) -> str:
         """Load a value of a dtype from memory and return its name."""
         stored = self.builder.llvm_types["i" if dtype == "b" else dtype]
         loaded = self.builder.load(stored, pointer, index)

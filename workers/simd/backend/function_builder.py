@@ -189,9 +189,13 @@ class FunctionBuilder:
             live -= sum(last[name] == number for name in set(VALUE.findall(line)))
         return most
 
-    def text(self) -> str:
-        """LLVM IR of the finished function."""
-        lines = [f"define internal void @{self.name}({', '.join(self.parameters)}) noinline #0 {{", "entry:"]
+    def text(self, calls: str = "noinline") -> str:
+        """LLVM IR of the finished function.
+
+        Args:
+            calls: LLVM's attribute that says what becomes of calls of it: `noinline` or `alwaysinline`.
+        """
+        lines = [f"define internal void @{self.name}({', '.join(self.parameters)}) {calls} #0 {{", "entry:"]
         return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
 
 

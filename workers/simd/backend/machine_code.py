@@ -21,7 +21,7 @@ def _initialize(*, native: bool) -> None:
         llvm.initialize_all_asmprinters()
 
 
-def _machine(target: Target) -> llvm.TargetMachine:
+def code_generator(target: Target) -> llvm.TargetMachine:
     """Code generator of LLVM for a target."""
     _initialize(native=target.triple == llvm.get_default_triple())
     return llvm.Target.from_triple(target.triple).create_target_machine(
@@ -31,7 +31,7 @@ def _machine(target: Target) -> llvm.TargetMachine:
 
 def compile_object(text: str, target: Target) -> bytes:
     """Compile LLVM IR to an object file. LLVM's optimiser is not run, because the graph is already simplified."""
-    code = _machine(target)
+    code = code_generator(target)
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = target.triple, str(code.target_data)
     module.verify()
@@ -41,7 +41,7 @@ def compile_object(text: str, target: Target) -> bytes:
 def load_object(code: bytes, target: Target) -> tuple[int, object]:
     """Load an object file; returns (address of `kernel`, object that must stay alive as long as it is used)."""
     # MCJIT is not used: it may place code and constants too far apart for the addresses of the small code model.
-    jit = llvm.create_lljit_compiler(_machine(target), use_jit_link=True, suppress_errors=True)
+    jit = llvm.create_lljit_compiler(code_generator(target), use_jit_link=True, suppress_errors=True)
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol("kernel").link(jit, "kernels")
     return library["kernel"], (jit, library)
 

@@ -59,6 +59,16 @@ PROCESSORS = {
         exact=0,
         attributes="nounwind",
     ),
+    # A GPU, by the code of ptx.py. It has no mode: each instruction says itself that denormal numbers are zeros.
+    "nvptx64": Processor(
+        triple="nvptx64-nvidia-cuda",
+        declarations="",
+        set_mode="",
+        restore_mode="",
+        zeros=0,
+        exact=0,
+        attributes='nounwind "denormal-fp-math-f32"="preserve-sign,preserve-sign"',
+    ),
 }
 ARCHITECTURES = {"x86_64": "x86_64", "amd64": "x86_64", "aarch64": "aarch64", "arm64": "aarch64"}
 """Architecture of code by the first part of LLVM's triple of a machine."""
@@ -92,6 +102,8 @@ ISAS = {
     "neon": Isa("NEON", "aarch64", 4, 128, 32, "generic", ()),
     "neon8": Isa("NEON on two registers", "aarch64", 8, 128, 32, "generic", ()),
     "neon16": Isa("NEON on four registers", "aarch64", 16, 128, 32, "generic", ()),
+    # A lane is a thread, whose registers have 32 bits; sm_90 are the H100 and H200.
+    "ptx": Isa("PTX", "nvptx64", 1, 32, 255, "sm_90", ()),
 }
 # fmt: on
 """Instruction sets by name. The first one of its architecture that a processor has is used; tests use the others."""
@@ -153,7 +165,8 @@ def host_target(isa: str | None = None) -> Target:
     machine = triple.partition("-")[0]
     of_machine = {name: one for name, one in ISAS.items() if one.architecture == ARCHITECTURES.get(machine)}
     if not of_machine:
-        raise NoVectorsError(f"simd has no code for the architecture {machine}, only for {', '.join(PROCESSORS)}")
+        known = ", ".join(dict.fromkeys(ARCHITECTURES.values()))
+        raise NoVectorsError(f"simd has no code for the architecture {machine}, only for {known}")
     if isa is not None and isa not in of_machine:
         raise NoVectorsError(f"{ISAS[isa].title} was requested, which {machine} does not have")
     lacks: list[str] = []

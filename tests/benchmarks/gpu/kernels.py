@@ -1,0 +1,132 @@
+"""Functions of a task for a GPU, one environment a thread: `ptx.ptx` makes kernels of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from es_service.protocol.noise import KEY_WORDS
+from workers.environments import SHIPPED, make_environment
+from workers.simd.backend.emit import graph_function
+from workers.simd.backend.function_builder import FunctionBuilder
+from workers.simd.backend.ptx import Call, Pointer, lane_function
+from workers.simd.backend.target import Target
+from workers.simd.backend.words import words_of
+from workers.simd.frontend.trace import trace_jaxpr
+
+KEY = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+
+
+class Physics(NamedTuple):
+    """A task's resets and control steps without a policy, as pure functions of one lane."""
+
+    begin: Callable[[Any], Any]
+    """Function from a key to (state, return)."""
+    step: Callable[[Any, Any], Any]
+    """Function ((state, return), action) -> (state, return)."""
+    carry: Any
+    """Shapes and dtypes of (state, return)."""
+    action: Any
+
+
+def physics_of(task: str) -> Physics:
+    """The physics of a shipped task. The return is the sum of rewards, also of those after the end of an episode."""
+    environment = make_environment(task, {})
+
+    def begin(key: Any) -> Any:
+        return environment.reset(key), jnp.float32(0.0)
+
+    def step(carry: Any, action: Any) -> Any:
+        state, reward, _ = environment.step(carry[0], action)
+        return state, carry[1] + reward
+
+    action = jax.ShapeDtypeStruct((SHIPPED[task].action_size,), jnp.float32)
+    return Physics(begin, step, jax.eval_shape(begin, KEY), action)
+
+
+def words_in(tree: Any) -> int:
+    """Words of one lane of a pytree of arrays."""
+    return sum(map(words_of, jax.tree.leaves(tree)))
+
+
+def function_of(
+    name: str,
+    function: Callable[..., Any],
+    arguments: Sequence[tuple[str, Any]],
+    out: str,
+    target: Target,
+    shared: Sequence[str] = (),
+) -> FunctionBuilder:
+    """Function `void name(ptr ..., i64 lanes)` of a JAX function.
+
+    Args:
+        arguments: (pointer, shapes and dtypes) of each of its arguments. A pointer may occur twice.
+        out: pointer to the words of the result.
+        shared: pointers whose words all lanes share.
+    """
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(tree for _, tree in arguments)))
+    sources = [(pointer, words_in(tree)) for pointer, tree in arguments]
+    apart = {*(pointer for pointer, _ in arguments), out} - set(shared)
+    return graph_function(name, graph, outputs, sources, out, target, apart=sorted(apart))
+
+
+def physics_functions(physics: Physics, target: Target) -> list[FunctionBuilder]:
+    """Functions of the kernels
+
+    begin(keys [4, lane], states [word, lane], lanes, 1)
+    physics(states [word, lane], actions [step, word, lane], lanes, steps)
+    """
+    begin = function_of("reset", physics.begin, [("keys", KEY)], "states", target)
+    step = function_of("step", physics.step, [("states", physics.carry), ("actions", physics.action)], "states", target)
+    actions = Pointer("actions", words_of_step=words_in(physics.action))
+    return [
+        begin,
+        step,
+        lane_function("begin", [Pointer("keys"), Pointer("states")], [Call(begin, ("keys", "states"))], target),
+        lane_function("physics", [Pointer("states"), actions], [Call(step, ("states", "actions"))], target),
+    ]
+
+
+def operations(a: Any, b: Any, c: Any, i: Any, j: Any) -> tuple[Any, ...]:
+    """Every operation of graphs and the elementary functions, of three floats and two integers."""
+    u, v = (lax.bitcast_convert_type(x, jnp.uint32) for x in (i, j))
+    return (
+        a + b, a - b, a * b, a / b, -a, jnp.abs(a), jnp.sqrt(a), jnp.floor(a), jnp.ceil(a), jnp.round(a),
+        a == b, a != b, a < b, a <= b, jnp.where(a < b, a, c), a * b + c, c - a * b, a * b - c,
+        i + j, i - j, i * j, i & j, i | j, i ^ j, i << 3, i >> 3, lax.shift_right_logical(i, 3), i == j, i < j, u < v,
+        i.astype(jnp.float32), u.astype(jnp.float32), (a < b) ^ (b < c), lax.population_count(i),
+        jnp.where(a < b, i, j), lax.bitcast_convert_type(i & 0x3FFFFFFF | 0x10000000, jnp.float32) * b,
+        lax.div(i, j), lax.rem(i, j), lax.div(u, v), lax.rem(u, v), a.astype(jnp.int32),
+        jnp.sin(a), jnp.cos(a), jnp.tan(a), jnp.arctan2(a, b), jnp.arcsin(a), jnp.arccos(a), jnp.exp(a), jnp.expm1(a),
+        jnp.log(a), jnp.log1p(a), jnp.tanh(a), lax.logistic(a), lax.rsqrt(a), lax.rem(a, b), jnp.power(a, b),
+    )  # fmt: skip
+
+
+FIVE = (*[jax.ShapeDtypeStruct((), jnp.float32)] * 3, *[jax.ShapeDtypeStruct((), jnp.int32)] * 2)
+"""Shapes and dtypes of the arguments of `operations`."""
+
+
+def operation_functions(target: Target) -> list[FunctionBuilder]:
+    """Functions of the kernel `operations(given [5, lane], found [word, lane], lanes, 1)`."""
+    function = function_of("compute", operations, [("given", one) for one in FIVE], "found", target)
+    pointers = [Pointer("given"), Pointer("found")]
+    return [function, lane_function("operations", pointers, [Call(function, ("given", "found"))], target)]
+
+
+def operation_arguments() -> np.ndarray:
+    """Words [5, lane] for `operations`: special values with each other, and random ones."""
+    rng = np.random.default_rng(0)
+    pool = np.array(
+        [0.0, -0.0, 1.0, -1.0, 0.3, np.inf, -np.inf, np.nan, 1e-30, 3e38, 2.5, 8388609.0, 2.0**-126, 1e-20], np.float32
+    )
+    special = rng.choice(pool, (3, 2048))
+    normal = (rng.normal(size=(3, 2048)) * 10.0 ** rng.integers(-6, 6, (3, 2048))).astype(np.float32)
+    floats = np.concatenate([special, normal], axis=1)
+    integers = rng.integers(0, 2**32, (2, 4096), dtype=np.uint32)
+    integers[:, ::7] = rng.choice(np.array([0, 1, 2**31, 2**32 - 1], np.uint32), (2, len(integers[0, ::7])))
+    return np.concatenate([floats.view(np.uint32), integers])

@@ -1,0 +1,139 @@
+"""Code for GPUs: on this processor its functions of single lanes have the bits of kernels, and ptxas accepts it."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from unittest import mock
+
+import jax
+import numpy as np
+import pytest
+
+from tests.benchmarks.gpu.kernels import (
+    FIVE,
+    function_of,
+    operation_arguments,
+    operation_functions,
+    operations,
+    physics_functions,
+    physics_of,
+)
+from workers.simd.backend.function_builder import FunctionBuilder, module
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.ptx import Call, Pointer, lane_function, ptx
+from workers.simd.backend.target import ISAS, Isa, Target, host_target, target_of
+from workers.simd.backend.words import pack
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.reference import evaluate
+
+LANES = 21
+NAN = np.uint32(0x7FC00000)
+
+
+@pytest.fixture
+def one() -> Iterator[Target]:
+    """Target of this processor with vectors of one lane."""
+    widest = ISAS[host_target().isa]
+    with mock.patch.dict(ISAS, {"one": Isa("single numbers", widest.architecture, 1, *widest[3:])}):
+        yield host_target("one")
+
+
+def on_host(functions: Sequence[FunctionBuilder], name: str) -> Callable[..., None]:
+    """A kernel of functions as a function (arrays ..., lanes, steps) of this processor."""
+    called = [f for f in functions if not f.name.endswith("_of_lane") or f.name == f"{name}_of_lane"]
+    of_lane = called[-1]
+    *arrays, _, _, _ = of_lane.parameters
+    inside = FunctionBuilder("inside", of_lane.parameters[:-1], of_lane.target)
+    names = [one.replace(" noalias", "") for one in of_lane.parameters[:-1]]
+    inside.loop(
+        "%lanes", lambda lane, _: (inside.do(f"call void @{of_lane.name}({', '.join(names)}, i64 {lane})"), [])[1]
+    )
+    text = module([*called, inside])
+    native = load_compiled(text, lambda: text, of_lane.target)
+    return native.function(*[ctypes.c_void_p] * len(arrays), ctypes.c_int64, ctypes.c_int64)
+
+
+def without_nans(words: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(words.view(np.float32)), NAN, words)
+
+
+def words_of(tree) -> np.ndarray:
+    """Words [word, lane] of arrays [lane, ...]."""
+    leaves = jax.tree.leaves(tree)
+    return np.ascontiguousarray(pack(leaves, len(leaves[0]))[0])
+
+
+@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, one: Target) -> None:
+    physics, functions = physics_of(task), physics_functions(physics_of(task), one)
+    rng, steps = np.random.default_rng(0), 5
+    keys = rng.integers(0, 2**32, (LANES, 4), dtype=np.uint32)
+    actions = rng.uniform(-1, 1, (steps, LANES, *physics.action.shape)).astype(np.float32)
+    carry = compile_kernel(physics.begin, jax.ShapeDtypeStruct((4,), np.uint32))(keys)
+    states = np.zeros((len(words_of(carry)), LANES), np.uint32)
+    on_host(functions, "begin")(np.ascontiguousarray(keys.T), states, LANES, 1)
+    np.testing.assert_array_equal(states, words_of(carry))
+    kernel = compile_kernel(physics.step, physics.carry, physics.action)
+    for action in actions:
+        carry = kernel(carry, action)
+    on_host(functions, "physics")(states, np.ascontiguousarray(actions.transpose(0, 2, 1)), LANES, steps)
+    np.testing.assert_array_equal(without_nans(states), without_nans(words_of(carry)))
+
+
+def test_operations_of_single_lanes_have_the_bits_of_the_reference(one: Target) -> None:
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(operations)(*FIVE))
+    given = operation_arguments()
+    with np.errstate(invalid="ignore"):
+        wanted = [np.asarray(x) for x in evaluate(graph, outputs, given)]
+    found = np.zeros((len(wanted), given.shape[1]), np.uint32)
+    on_host(operation_functions(one), "operations")(given, found, given.shape[1], 1)
+    for number, (ours, theirs) in enumerate(zip(found, wanted, strict=True)):
+        theirs = theirs.astype(np.uint32) if theirs.dtype == bool else theirs
+        np.testing.assert_array_equal(ours.view(theirs.dtype), theirs, err_msg=f"result {number}")
+
+
+def test_every_float_instruction_rounds_to_nearest_and_flushes_denormal_numbers() -> None:
+    text = ptx(operation_functions(target_of("ptx")))
+    names = {match[1] for match in re.finditer(r"^\s+(?:@!?%p\d+ )?([a-z][\w.]*\.f32)\b", text, re.MULTILINE)}
+    arithmetic = {name for name in names if name.split(".")[0] in ("add", "sub", "mul", "fma", "div", "sqrt", "rcp")}
+    assert {name.split(".")[0] for name in arithmetic} >= {"add", "sub", "mul", "fma", "div", "sqrt"}
+    assert all(name.split(".")[1:] == ["rn", "ftz", "f32"] for name in arithmetic)
+    others = {name for name in names - arithmetic if name.split(".")[0] in ("setp", "cvt", "neg", "abs")}
+    assert all("ftz" in name for name in others if name.count("f32") == 2 or not name.startswith("cvt"))
+    assert not {name for name in names if "approx" in name}
+
+
+def test_a_product_and_a_sum_are_fused_only_where_the_graph_says() -> None:
+    float_ = jax.ShapeDtypeStruct((), np.float32)
+    arguments = [("given", float_)] * 3
+
+    def text(function) -> str:
+        made = function_of("f", function, arguments, "found", target_of("ptx"))
+        pointers = [Pointer("given"), Pointer("found")]
+        return ptx([made, lane_function("k", pointers, [Call(made, ("given", "found"))], target_of("ptx"))])
+
+    fused, apart = text(lambda a, b, c: a * b + c), text(lambda a, b, c: (a * b, a * b * c))
+    assert fused.count("fma.rn.ftz.f32") == 1
+    assert "mul.rn" not in fused
+    assert apart.count("mul.rn.ftz.f32") == 2
+    assert "fma" not in apart
+
+
+def test_loops_keep_their_carries_in_registers() -> None:
+    text = ptx(physics_functions(physics_of("point_maze"), target_of("ptx")))
+    assert ".local" not in text
+    assert "__local_depot" not in text
+
+
+@pytest.mark.skipif(not shutil.which("ptxas"), reason="ptxas is not installed")
+def test_ptxas_accepts_a_task(tmp_path) -> None:
+    (tmp_path / "k.ptx").write_text(ptx(physics_functions(physics_of("point_maze"), target_of("ptx"))))
+    command = ["ptxas", "-v", "-arch=sm_90a", str(tmp_path / "k.ptx"), "-o", str(tmp_path / "k.cubin")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "0 bytes spill stores" in done.stderr
