@@ -19,25 +19,40 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from es_service.protocol.noise import NORMAL_STD, normal_integers
 from tests.benchmarks.gpu import on_device
 from tests.benchmarks.gpu.kernels import (
     FIVE,
     KEY,
+    episode_functions,
+    inputs_of,
     operation_arguments,
     operation_functions,
     operations,
     physics_functions,
     physics_of,
+    policy_layout,
+    worker_spec,
 )
+from workers.environments import make_environment
+from workers.episode import episode_steps
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.ptx import ptx
 from workers.simd.backend.target import target_of
 from workers.simd.backend.words import pack
+from workers.simd.episodes import reference
+from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.elementary import TANH
 from workers.simd.graph.reference import evaluate
 
 ARCHITECTURE = "sm_90a"
 LANES, STEPS = 256, 200
+PAIRS = 32
+"""Pairs whose training episodes are compared."""
+ROLLOUT_STEPS = (1, 2, 10, 100, 250, 1000)
+"""Steps after which their words are kept."""
 FULL_STEPS = (1, 2, 10, 100, 200)
 """Steps after which all words are kept; of the others a digest of each lane's."""
 
@@ -52,10 +67,16 @@ def assembled(folder: Path, name: str, text: str, registers: int | None = None) 
     source.write_text(text)
     limit = [f"-maxrregcount={registers}"] if registers else []
     command = ["ptxas", "-v", f"-arch={ARCHITECTURE}", *limit, str(source), "-o", str(folder / f"{name}.cubin")]
+    found = reported(command, f"ptxas refuses {source}")
+    source.unlink()
+    return found
+
+
+def reported(command: list[str], refused: str) -> dict:
+    """Run a compiler; returns what ptxas says of each kernel."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"ptxas refuses {source}: {done.stderr}")
-    source.unlink()
+        raise SystemExit(f"{refused}: {done.stderr}")
     pattern = r"Function properties for (\w+)\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\s.*?Used (\d+) registers"  # noqa: E501
     return {
         kernel: {"stack": int(stack), "spill_stores": int(stores), "spill_loads": int(loads), "registers": int(used)}
@@ -74,7 +95,7 @@ def physics_files(folder: Path, task: str) -> None:
     physics = physics_of(task)
     begin, step = compile_kernel(physics.begin, KEY), compile_kernel(physics.step, physics.carry, physics.action)
     keys = np.random.default_rng(0).integers(0, 2**32, (LANES, 4), dtype=np.uint32)
-    actions = np.random.default_rng(1).uniform(-1, 1, (STEPS, LANES, *physics.action.shape)).astype(np.float32)
+    actions = on_device.physics_actions(STEPS, on_device.ACTIONS, LANES).transpose(0, 2, 1)
     carry = begin(keys)
     kept, digests, first = {0: rows(carry)}, [on_device.digest(rows(carry))], carry
     for number in range(1, STEPS + 1):
@@ -91,11 +112,88 @@ def physics_files(folder: Path, task: str) -> None:
     np.savez_compressed(
         folder / f"{task}.npz",
         keys=np.ascontiguousarray(keys.T),
-        actions=np.ascontiguousarray(actions.transpose(0, 2, 1)),
         digests=np.stack(digests),
         numbers=np.array(list(kept)),
         states=np.stack(list(kept.values())),
     )
+
+
+def policy_code(folder: Path, task: str) -> dict:
+    """Compile `policy.cu` for a task to `TASK_policy.cubin` in a folder; returns what ptxas says of each kernel."""
+    source = Path(__file__).with_name("policy.cu")
+    flags = ["-O3", "-ftz=true", "-fmad=false", "-prec-div=true", "-prec-sqrt=true", "-Xptxas", "-v", *defined(task)]
+    command = [
+        "nvcc",
+        "-cubin",
+        f"-arch={ARCHITECTURE}",
+        *flags,
+        str(source),
+        "-o",
+        str(folder / f"{task}_policy.cubin"),
+    ]
+    return reported(command, f"nvcc refuses {source}")
+
+
+def defined(task: str) -> list[str]:
+    """Definitions with which `policy.cu` is compiled for a task."""
+    sizes = {"INPUTS": len(inputs_of(task)), "OUTPUTS": worker_spec(task).policy.outputs}
+    parts = zip(("ABOVE", "BELOW"), TANH, strict=True)
+    tanh = {f"TANH_{name}_{k}": f"{x!r}f" for name, part in parts for k, x in enumerate(part)}
+    return [f"-D{name}={value}" for name, value in (sizes | tanh).items()]
+
+
+def rollout_files(folder: Path, task: str) -> None:
+    """Write the arguments of a task's training episodes, and what the first PAIRS pairs must give."""
+    spec, inputs_O = worker_spec(task), inputs_of(task)
+    layout = policy_layout(spec.policy, inputs_O)
+    rng = np.random.default_rng(2)
+    centre_D = initial_parameters(spec.policy, "unit_columns", 5)
+    unit = np.float32(0.05 / NORMAL_STD)
+    mean_O, std_O = np.zeros((2, spec.policy.widths[0]), np.float32)
+    mean_O[inputs_O] = rng.normal(0, 0.1, len(inputs_O))
+    std_O += rng.uniform(0.5, 2.0, len(std_O)).astype(np.float32)
+    noise_keys, reset_keys, action_keys = (
+        rng.integers(0, 2**32, (count, 4), dtype=np.uint32) for count in (PAIRS, 2 * PAIRS, 2 * PAIRS)
+    )
+    kernel = compile_episodes(make_environment(task, {}), spec, inputs_O, training=True)
+    packed = kernel.network.pack(centre_D)
+    carries, go = kernel.started(packed, float(unit), mean_O, std_O, noise_keys, reset_keys, action_keys)
+    # What is not masked after an episode's end differs between kernels: the CPU's has no policy for a dead block.
+    kept, last = {0: by_lane(carries)}, 0
+    for number in ROLLOUT_STEPS:
+        go(number - last)
+        kept[number], last = by_lane(carries), number
+    # One step of the policy by its definition: what it sees after a reset, and its outputs.
+    steps = episode_steps(make_environment(task, {}), spec, training=True, inputs_O=inputs_O)
+    inputs = jax.ShapeDtypeStruct((len(inputs_O),), np.float32)
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.normalised_observation)(kernel.carry, inputs, inputs))
+    constants = np.stack([mean_O[inputs_O], std_O[inputs_O]])
+    lanes = np.broadcast_to(constants.reshape(-1, 1), (constants.size, 2 * PAIRS)).view(np.uint32)
+    seen = np.stack(evaluate(graph, outputs, np.concatenate([kept[0], lanes])))
+    actions = reference.policy(spec.policy, inputs_O, seen, reference.perturbed(centre_D, unit, noise_keys))
+    noise = np.stack([normal_integers(np, key, layout.noise) for key in noise_keys[:2]])
+    np.savez_compressed(
+        folder / f"{task}_rollout.npz",
+        unit=unit,
+        centre=centre_D[layout.centre],
+        coordinates=layout.noise,
+        constants=constants.reshape(-1),
+        noise_keys=noise_keys,
+        reset_keys=np.ascontiguousarray(reset_keys.T),
+        action_keys=np.ascontiguousarray(action_keys.T),
+        noise=(((noise - 1) >> 1) + 128).astype(np.uint8),
+        seen=seen,
+        actions=actions,
+        numbers=np.array(list(kept)),
+        carries=np.stack(list(kept.values())),
+        alive_word=kernel.alive_word,
+        episode_words=kernel.episode_words,
+    )
+
+
+def by_lane(carries: np.ndarray) -> np.ndarray:
+    """Words [word, lane] of [block, word, lane]."""
+    return np.concatenate(list(carries), axis=1)[:, : 2 * PAIRS].copy()
 
 
 def operation_files(folder: Path) -> None:
@@ -125,6 +223,13 @@ def main() -> None:
         for registers in on_device.REGISTERS:
             said[f"{task}_{registers}"] = assembled(folder, f"{task}_{registers}", text, registers)
         physics_files(folder, task)
+    for task in on_device.ROLLOUTS:
+        text = ptx(episode_functions(task, target))
+        for registers in on_device.REGISTERS:
+            name = f"{task}_episodes_{registers}"
+            said[name] = assembled(folder, name, text, registers)
+        said[f"{task}_policy"] = policy_code(folder, task)
+        rollout_files(folder, task)
     (folder / "ptxas.json").write_text(json.dumps(said, indent=1))
     for name, kernels in said.items():
         print(name, json.dumps(kernels))

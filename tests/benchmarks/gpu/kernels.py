@@ -10,15 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.policy_spec import PolicySpec
 from workers.environments import SHIPPED, make_environment
+from workers.episode import episode_steps
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.backend.ptx import Call, Pointer, lane_function
 from workers.simd.backend.target import Target
 from workers.simd.backend.words import words_of
+from workers.simd.episodes.rollout import always_zero
 from workers.simd.frontend.trace import trace_jaxpr
 
+HIDDEN = 256
+"""Units of each of the two hidden layers of the policies."""
 KEY = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
 
 
@@ -90,6 +96,95 @@ def physics_functions(physics: Physics, target: Target) -> list[FunctionBuilder]
         lane_function("begin", [Pointer("keys"), Pointer("states")], [Call(begin, ("keys", "states"))], target),
         lane_function("physics", [Pointer("states"), actions], [Call(step, ("states", "actions"))], target),
     ]
+
+
+def worker_spec(task: str) -> WorkerSpec:
+    """A run of a shipped task with a policy of two hidden layers of HIDDEN units and action noise."""
+    size = SHIPPED[task]
+    return WorkerSpec(
+        seed=0,
+        environment=task,
+        environment_options={},
+        policy=PolicySpec((size.observation_size, HIDDEN, HIDDEN, size.action_size)),
+        episode_steps=size.episode_steps,
+        fitness="sum",
+        episodes_per_member=1,
+        observation_clip=5.0,
+        action_noise=0.05,
+        common_random_numbers=True,
+        chunk_pairs=1,
+        rollout_block_pairs=1,
+        gradient_block_pairs=1,
+        rollout="simd",
+    )
+
+
+def inputs_of(task: str) -> np.ndarray:
+    """Indices of the observations that are not always zero."""
+    return np.flatnonzero(~always_zero(make_environment(task, {})))
+
+
+def episode_functions(task: str, target: Target) -> list[FunctionBuilder]:
+    """Functions of the kernels of training episodes, of all lanes at a time:
+
+    begin(keys [4, lane], carries [word, lane], lanes, 1)
+    look(carries, constants [2 * input], seen [input, lane], lanes, 1)
+    advance(carries, constants, actions [action, lane], action_keys [4, lane], seen, lanes, 1)
+
+    constants are the means and standard deviations of the inputs. `advance` moves and looks again.
+    """
+    spec, inputs_O = worker_spec(task), inputs_of(task)
+    steps = episode_steps(make_environment(task, {}), spec, training=True, inputs_O=inputs_O)
+    carry = jax.eval_shape(steps.begin, KEY)
+    inputs, outputs = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (len(inputs_O), spec.policy.outputs))
+    of_carry, of_constants = ("carries", carry), ("constants", inputs)
+    reset = function_of("reset", steps.begin, [("keys", KEY)], "carries", target)
+    see = function_of(
+        "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
+    )
+    given = [of_carry, of_constants, ("actions", outputs), ("action_keys", KEY)]
+    move = function_of("move", steps.advance, given, "carries", target, ["constants"])
+    carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
+    sees = Call(see, ("carries", "constants", "seen"))
+    moves = Call(move, ("carries", "constants", "actions", "action_keys"))
+    of_move = [carries, constants, Pointer("actions"), Pointer("action_keys"), seen]
+    return [
+        reset,
+        see,
+        move,
+        lane_function("begin", [Pointer("keys"), carries], [Call(reset, ("keys", "carries"))], target),
+        lane_function("look", [carries, constants, seen], [sees], target),
+        lane_function("advance", of_move, [moves, sees], target),
+    ]
+
+
+class PolicyLayout(NamedTuple):
+    """Places of a policy's parameters in the memory of policy.cu."""
+
+    noise: np.ndarray
+    """Coordinate of each byte of a pair's noise; bytes that are never used have coordinate 0."""
+    centre: np.ndarray
+    """Coordinate of each float of the centre."""
+
+
+def policy_layout(spec: PolicySpec, inputs_O: np.ndarray) -> PolicyLayout:
+    """Layout of a policy with two hidden layers of HIDDEN units."""
+    noise, centre, start, rows = [], [], 0, inputs_O
+    for number, (inputs, outputs) in enumerate(spec.layers):
+        weights = start + rows[:, None] * outputs + np.arange(outputs)
+        biases = start + inputs * outputs + np.arange(outputs)
+        if number + 1 < len(spec.layers):
+            padded = np.concatenate([weights, np.zeros((-len(rows) % 4, outputs), weights.dtype)])
+            noise.append(padded.reshape(-1, 4, outputs // 4, 4).transpose(0, 2, 1, 3))
+        else:
+            weights = weights.T
+            noise.append(weights)
+        noise.append(biases)
+        centre += [weights, biases]
+        start, rows = start + (inputs + 1) * outputs, np.arange(outputs)
+    bytes_ = np.concatenate([one.reshape(-1) for one in noise])
+    bytes_ = np.concatenate([bytes_, np.zeros(-len(bytes_) % 128, bytes_.dtype)])
+    return PolicyLayout(bytes_.astype(np.uint32), np.concatenate([one.reshape(-1) for one in centre]))
 
 
 def operations(a: Any, b: Any, c: Any, i: Any, j: Any) -> tuple[Any, ...]:

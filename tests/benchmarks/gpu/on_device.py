@@ -10,6 +10,7 @@ before anything is timed; a part that fails says so and the next one goes on. Af
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import json
 import os
@@ -27,9 +28,16 @@ import numpy as np
 HERE = Path(__file__).parent
 PHYSICS = ("ant_trap", "ant_maze")
 """Tasks whose physics is compared and timed."""
+ACTIONS = 8
+"""Numbers of an action of these tasks."""
 REGISTERS = (255, 168, 128, 96, 64)
 """Limits of registers of a thread for which there is code."""
+ROLLOUTS = ("ant_maze", "ant_trap")
+"""Tasks whose training episodes are compared and timed."""
+POLICIES = {"policy_1_2": 4, "policy_1_4": 4, "policy_2_2": 8, "policy_2_3": 8, "policy_4_1": 16}
+"""Kernels of policies -> pairs of a block."""
 STEPS_OF_LAUNCH = 50
+STEPS_OF_GRAPH = 20
 REPEATS = 3
 NAN = np.uint32(0x7FC00000)
 
@@ -40,7 +48,7 @@ def without_nans(words: np.ndarray) -> np.ndarray:
 
 
 def digest(words: np.ndarray) -> np.ndarray:
-    """A word for each lane of words [word, lane], which one differing word always changes; all NaN count as the same."""
+    """A word for each lane of words [word, lane], which one differing word always changes; all NaN are the same."""
     factors = np.random.default_rng(7).integers(0, 2**31, len(words), dtype=np.uint32) * np.uint32(2) + np.uint32(1)
     return np.add.reduce(without_nans(words) * factors[:, None], axis=0, dtype=np.uint32)
 
@@ -48,6 +56,11 @@ def digest(words: np.ndarray) -> np.ndarray:
 def differing(found: np.ndarray, wanted: np.ndarray) -> int:
     """Number of words that differ; all NaN count as the same."""
     return int(np.count_nonzero(without_nans(found) != without_nans(wanted)))
+
+
+def physics_actions(steps: int, size: int, lanes: int) -> np.ndarray:
+    """Random actions [step, action, lane]."""
+    return np.random.default_rng(1).uniform(-1, 1, (steps, size, lanes)).astype(np.float32)
 
 
 class Results:
@@ -68,12 +81,12 @@ class Kernels:
     """The kernels of one file of code, called with arrays of the GPU and whole numbers."""
 
     def __init__(self, cupy: Any, name: str) -> None:
-        self.cupy, self.module = cupy, cupy.RawModule(path=str(HERE / f"{name}.cubin"))
+        self.function = functools.cache(cupy.RawModule(path=str(HERE / f"{name}.cubin")).get_function)
 
     def __call__(self, name: str, arrays: Iterable[Any], lanes: int, steps: int = 1, block: int = 32) -> None:
         """Run a kernel with a thread for each lane."""
         numbers = (np.int64(lanes), np.int64(steps))
-        self.module.get_function(name)((-(-lanes // block),), (block,), (*arrays, *numbers))
+        self.function(name)((-(-lanes // block),), (block,), (*arrays, *numbers))
 
 
 def seconds_of(cupy: Any, work: Callable[..., object], *given: Any, repeats: int = REPEATS) -> list[float]:
@@ -111,9 +124,10 @@ def compare_operations(cupy: Any, say: Results) -> None:
 def compare_physics(cupy: Any, say: Results, task: str, registers: int) -> None:
     """Compare a task's resets and control steps with those of the processor: all in single steps, and all in one."""
     file, kernels = np.load(HERE / f"{task}.npz"), Kernels(cupy, f"{task}_{registers}")
-    digests, actions = file["digests"], cupy.asarray(file["actions"])
+    digests = file["digests"]
     kept = dict(zip(file["numbers"].tolist(), file["states"], strict=True))
     steps, lanes = len(digests) - 1, digests.shape[1]
+    actions = cupy.asarray(physics_actions(steps, ACTIONS, lanes))
     states = cupy.asarray(np.full(kept[0].shape, 0xAAAAAAAA, np.uint32))
     keys = cupy.asarray(file["keys"])
     kernels("begin", [keys, states], lanes)
@@ -136,7 +150,7 @@ def compare_physics(cupy: Any, say: Results, task: str, registers: int) -> None:
 def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], variants: Iterable[tuple[int, int]]) -> None:
     """Time a task's control steps without policies; a variant is (limit of registers, threads of a block)."""
     rng, file = np.random.default_rng(3), np.load(HERE / f"{task}.npz")
-    few = rng.uniform(-1, 1, (STEPS_OF_LAUNCH, file["actions"].shape[1], 1024)).astype(np.float32)
+    few = physics_actions(STEPS_OF_LAUNCH, ACTIONS, 1024)
     variants = list(variants)
     for lanes in sizes:
         actions = cupy.asarray(np.tile(few, (1, 1, lanes // 1024)))
@@ -150,6 +164,187 @@ def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], varia
             say("physics_speed", task=task, lanes=lanes, registers=registers, block=block,
                 steps_per_s=round(statistics.median(rates)), us_per_step=round(
                     statistics.median(runs) / STEPS_OF_LAUNCH * 1e6, 1), runs=rates)  # fmt: skip
+
+
+class Rollout:
+    """Training episodes of a task in a stream of the GPU's work: as many pairs as there are keys."""
+
+    def __init__(self, cupy: Any, task: str, file: Any, keys: tuple[np.ndarray, ...], registers: int = 255) -> None:
+        self.cupy, self.episodes = cupy, Kernels(cupy, f"{task}_episodes_{registers}")
+        self.policies = Kernels(cupy, f"{task}_policy").function
+        noise_keys, reset_keys, action_keys = keys
+        self.pairs, self.members, self.unit = len(noise_keys), reset_keys.shape[1], np.float32(file["unit"])
+        coordinates = file["coordinates"]
+        self.stream = cupy.cuda.Stream(non_blocking=True)
+        self.centre, self.constants, self.coordinates, self.noise_keys, self.reset_keys, self.action_keys = (
+            cupy.asarray(one)
+            for one in (file["centre"], file["constants"], coordinates, noise_keys, reset_keys, action_keys)
+        )
+        self.noise = cupy.empty((self.pairs, len(coordinates)), np.uint8)
+        words, inputs, outputs = len(file["carries"][0]), len(file["seen"]), len(file["actions"])
+        self.carries, self.seen, self.actions = (
+            cupy.empty((count, self.members), np.uint32) for count in (words, inputs, outputs)
+        )
+        self.policy, self.block = "policy_2_2", 32
+        cupy.cuda.runtime.deviceSynchronize()  # copies are in another stream
+
+    def start(self) -> None:
+        """Make the noise, reset all episodes, and look."""
+        with self.stream:
+            grid = (-(-self.noise.shape[1] // 256), self.pairs)
+            self.policies("fill")(grid, (256,), (self.noise_keys, self.coordinates, self.noise))
+            self.episodes("begin", [self.reset_keys, self.carries], self.members)
+            self.episodes("look", [self.carries, self.constants, self.seen], self.members)
+
+    def decide(self, times: int = 1) -> None:
+        """Compute the actions."""
+        grid = (-(-self.pairs // POLICIES[self.policy]),)
+        given = (self.seen, self.noise, self.centre, self.actions, self.unit, np.int32(self.pairs))
+        for _ in range(times):
+            self.policies(self.policy)(grid, (256,), given)
+
+    def advance(self, times: int = 1) -> None:
+        """Move and look."""
+        given = [self.carries, self.constants, self.actions, self.action_keys, self.seen]
+        for _ in range(times):
+            self.episodes("advance", given, self.members, block=self.block)
+
+    def run(self, steps: int) -> None:
+        """Control steps, launched one by one."""
+        with self.stream:
+            for _ in range(steps):
+                self.decide()
+                self.advance()
+
+    def graph(self, steps: int) -> Any:
+        """Control steps as one graph, to be launched again and again."""
+        with self.stream:
+            self.stream.begin_capture()
+            for _ in range(steps):
+                self.decide()
+                self.advance()
+            return self.stream.end_capture()
+
+    def words(self) -> np.ndarray:
+        """Words [word, lane] of the carries."""
+        self.stream.synchronize()
+        return self.cupy.asnumpy(self.carries)
+
+
+def rollout_keys(file: Any, members: int) -> tuple[np.ndarray, ...]:
+    """Keys (noise, reset, action) of members, of which the first are those that are compared."""
+    rng = np.random.default_rng(11)
+    compared = file["noise_keys"], file["reset_keys"], file["action_keys"]
+    noise, reset, action = (
+        rng.integers(0, 2**32, shape, dtype=np.uint32) for shape in ((members // 2, 4), (4, members), (4, members))
+    )
+    few = min(members, compared[1].shape[1])
+    noise[: few // 2], reset[:, :few], action[:, :few] = (
+        compared[0][: few // 2], compared[1][:, :few], compared[2][:, :few])  # fmt: skip
+    return noise, reset, action
+
+
+def rollout_wrong(file: Any, words: np.ndarray, number: int) -> dict[str, int]:
+    """Words of the compared members that differ after some steps. Of those whose episode is over, what is not of the
+    episode's result goes on in each kernel in its own way, and is not compared."""
+    wanted = file["carries"][file["numbers"].tolist().index(number)]
+    alive = wanted[int(file["alive_word"])] != 0
+    found = words[:, : wanted.shape[1]]
+    result = slice(len(wanted) - int(file["episode_words"]), None)
+    return {
+        "alive": int(alive.sum()),
+        "words_wrong": differing(found[:, alive], wanted[:, alive]),
+        "result_words_wrong": differing(found[result], wanted[result]),
+    }
+
+
+def compare_rollouts(cupy: Any, say: Results, task: str) -> None:
+    """Compare noise, observations, outputs of each kernel of policies, and whole episodes with the processor's."""
+    file = np.load(HERE / f"{task}_rollout.npz")
+    members = file["reset_keys"].shape[1]
+    one = Rollout(cupy, task, file, rollout_keys(file, members))
+    one.start()
+    one.stream.synchronize()
+    used = file["coordinates"] != 0
+    noise = cupy.asnumpy(one.noise)[: len(file["noise"])]
+    say("rollout_bits", task=task, what="noise", bytes_wrong=int((noise != file["noise"])[:, used].sum()))
+    say("rollout_bits", task=task, what="reset", **rollout_wrong(file, one.words(), 0))
+    seen = differing(cupy.asnumpy(one.seen), file["seen"])
+    say("rollout_bits", task=task, what="seen", words_wrong=seen, words=file["seen"].size)
+    for policy in POLICIES:
+        one.policy = policy
+        with one.stream:
+            one.decide()
+        one.stream.synchronize()
+        wrong = differing(cupy.asnumpy(one.actions), file["actions"].view(np.uint32))
+        say("rollout_bits", task=task, what=policy, words_wrong=wrong, words=file["actions"].size)
+    one.policy, done = "policy_2_2", 0
+    for number in file["numbers"].tolist():
+        one.run(number - done)
+        done = number
+        say("rollout_bits", task=task, what="episodes", steps=number, **rollout_wrong(file, one.words(), number))
+
+
+def time_rollouts(cupy: Any, say: Results, task: str, members: int, steps: int) -> None:
+    """Time whole control steps of members: each kernel alone, then the fastest together, in one stream or several."""
+    file = np.load(HERE / f"{task}_rollout.npz")
+    keys = rollout_keys(file, members)
+    one = Rollout(cupy, task, file, keys)
+    one.start()
+    alone: dict[tuple, float] = {}
+    with one.stream:
+        for policy in POLICIES:
+            one.policy = policy
+            alone[policy,] = min(seconds_of(cupy, one.decide, 10)) / 10
+        best_policy = one.policy = min(POLICIES, key=lambda policy: alone[policy,])
+        for registers in REGISTERS:
+            one.episodes = Kernels(cupy, f"{task}_episodes_{registers}")
+            for block in (32, 64, 128):
+                one.block = block
+                alone[registers, block] = min(seconds_of(cupy, one.advance, 10)) / 10
+    registers, block = min((key for key in alone if len(key) == 2), key=alone.__getitem__)
+    say("rollout_parts", task=task, members=members, us={"/".join(map(str, key)): round(1e6 * x, 1)
+        for key, x in alone.items()}, best=[best_policy, registers, block])  # fmt: skip
+    del one
+    for streams in (1, 2, 4):
+        parts = [
+            Rollout(cupy, task, file, part, registers)
+            for part in zip(
+                *(np.split(whole, streams, axis=axis) for whole, axis in zip(keys, (0, 1, 1), strict=True)), strict=True
+            )
+        ]
+        for policy in dict.fromkeys((best_policy, "policy_1_2", "policy_2_3")):
+            for part in parts:
+                part.policy, part.block = policy, block
+            rates = timed_rollouts(cupy, parts, steps)
+            wrong = rollout_wrong(file, parts[0].words(), steps) if steps in file["numbers"] else None
+            say("rollout_speed", task=task, members=members, streams=streams, policy=policy, registers=registers,
+                block=block, steps=steps, **rates, compared=wrong)  # fmt: skip
+
+
+def timed_rollouts(cupy: Any, parts: list[Rollout], steps: int) -> dict[str, Any]:
+    """Control steps a second of all parts at a time: launched one by one, and as graphs; each from the reset."""
+    members, chunk = sum(part.members for part in parts), min(steps, STEPS_OF_GRAPH)
+
+    def rate(work: Callable[[int], object]) -> int:
+        """Steps a second of `work(number of the part)`, which does `chunk` steps."""
+        for part in parts:
+            part.start()
+        cupy.cuda.runtime.deviceSynchronize()
+        started = time.perf_counter()
+        for _ in range(steps // chunk):
+            for number in range(len(parts)):
+                work(number)
+        cupy.cuda.runtime.deviceSynchronize()
+        return round(members * (steps // chunk) * chunk / (time.perf_counter() - started))
+
+    found: dict[str, Any] = {"by_launches": rate(lambda number: parts[number].run(chunk))}
+    try:
+        graphs = [part.graph(chunk) for part in parts]
+        found["by_graphs"] = rate(lambda number: graphs[number].launch(parts[number].stream))
+    except Exception as error:  # what was launched one by one counts as well
+        found["by_graphs"] = repr(error)
+    return found
 
 
 def main() -> None:
@@ -171,6 +366,13 @@ def main() -> None:
         lambda: time_physics(cupy, say, "ant_trap", (1024, 4096, 16384, 65536, 262144), every),
         lambda: time_physics(cupy, say, "ant_maze", (1024, 8192, 16384, 65536), [(255, 32), (255, 64), (128, 64)]),
     ]
+    parts += [lambda t=t: compare_rollouts(cupy, say, t) for t in ROLLOUTS]
+    parts += [
+        lambda t=t, m=m, s=s: time_rollouts(cupy, say, t, m, s)
+        for t, m, s in (
+            ("ant_maze", 8192, 1000), ("ant_maze", 1024, 1000), ("ant_maze", 32768, 250), ("ant_trap", 8192, 250),
+        )
+    ]  # fmt: skip
     failed = 0
     for part in parts:
         try:
