@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import lzma
 import re
 import shutil
 import subprocess
@@ -24,6 +25,7 @@ from tests.benchmarks.gpu import on_device
 from tests.benchmarks.gpu.kernels import (
     FIVE,
     KEY,
+    division_functions,
     episode_functions,
     inputs_of,
     operation_arguments,
@@ -73,10 +75,13 @@ def assembled(folder: Path, name: str, text: str, registers: int | None = None) 
 
 
 def reported(command: list[str], refused: str) -> dict:
-    """Run a compiler; returns what ptxas says of each kernel."""
+    """Run a compiler and pack its result, whose name comes last; returns what ptxas says of each kernel."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{refused}: {done.stderr}")
+    code = Path(command[-1])
+    Path(f"{code}.xz").write_bytes(lzma.compress(code.read_bytes()))
+    code.unlink()
     pattern = r"Function properties for (\w+)\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\s.*?Used (\d+) registers"  # noqa: E501
     return {
         kernel: {"stack": int(stack), "spill_stores": int(stores), "spill_loads": int(loads), "registers": int(used)}
@@ -182,8 +187,8 @@ def rollout_files(folder: Path, task: str) -> None:
         reset_keys=np.ascontiguousarray(reset_keys.T),
         action_keys=np.ascontiguousarray(action_keys.T),
         noise=(((noise - 1) >> 1) + 128).astype(np.uint8),
-        seen=seen,
-        actions=actions,
+        seen=seen.view(np.uint32),
+        actions=actions.view(np.uint32),
         numbers=np.array(list(kept)),
         carries=np.stack(list(kept.values())),
         alive_word=kernel.alive_word,
@@ -218,16 +223,17 @@ def main() -> None:
     target, said = target_of("ptx"), {}
     said["operations"] = assembled(folder, "operations", ptx(operation_functions(target)))
     operation_files(folder)
+    said["division"] = assembled(folder, "division", ptx(division_functions(target)))
     for task in on_device.PHYSICS:
-        text = ptx(physics_functions(physics_of(task), target))
-        for registers in on_device.REGISTERS:
-            said[f"{task}_{registers}"] = assembled(folder, f"{task}_{registers}", text, registers)
+        text = {quick: ptx(physics_functions(physics_of(task), target, quick=quick)) for quick in (False, True)}
+        for name, (registers, quick) in on_device.VARIANTS.items():
+            said[f"{task}_{name}"] = assembled(folder, f"{task}_{name}", text[quick], registers)
         physics_files(folder, task)
     for task in on_device.ROLLOUTS:
-        text = ptx(episode_functions(task, target))
-        for registers in on_device.REGISTERS:
-            name = f"{task}_episodes_{registers}"
-            said[name] = assembled(folder, name, text, registers)
+        text = {quick: ptx(episode_functions(task, target, quick=quick)) for quick in (False, True)}
+        for name, (registers, quick) in on_device.VARIANTS.items():
+            whole = f"{task}_episodes_{name}"
+            said[whole] = assembled(folder, whole, text[quick], registers)
         said[f"{task}_policy"] = policy_code(folder, task)
         rollout_files(folder, task)
     (folder / "ptxas.json").write_text(json.dumps(said, indent=1))

@@ -18,6 +18,7 @@ from workers.episode import episode_steps
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.backend.ptx import Call, Pointer, lane_function
+from workers.simd.backend.quick_division import EXACT, QuickWriter
 from workers.simd.backend.target import Target
 from workers.simd.backend.words import words_of
 from workers.simd.episodes.rollout import always_zero
@@ -67,34 +68,40 @@ def function_of(
     out: str,
     target: Target,
     shared: Sequence[str] = (),
-) -> FunctionBuilder:
-    """Function `void name(ptr ..., i64 lanes)` of a JAX function.
+    quick: bool = False,
+) -> list[FunctionBuilder]:
+    """Function `void name(ptr ..., i64 lanes)` of a JAX function, and functions that it calls; it is the last one.
 
     Args:
         arguments: (pointer, shapes and dtypes) of each of its arguments. A pointer may occur twice.
         out: pointer to the words of the result.
         shared: pointers whose words all lanes share.
+        quick: whether quotients and roots are those of `quick_division.py`.
     """
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(tree for _, tree in arguments)))
     sources = [(pointer, words_in(tree)) for pointer, tree in arguments]
     apart = {*(pointer for pointer, _ in arguments), out} - set(shared)
-    return graph_function(name, graph, outputs, sources, out, target, apart=sorted(apart))
+    exact = graph_function(name + EXACT * quick, graph, outputs, sources, out, target, sorted(apart))
+    if not quick:
+        return [exact]
+    return [exact, graph_function(name, graph, outputs, sources, out, target, sorted(apart), QuickWriter)]
 
 
-def physics_functions(physics: Physics, target: Target) -> list[FunctionBuilder]:
+def physics_functions(physics: Physics, target: Target, *, quick: bool = False) -> list[FunctionBuilder]:
     """Functions of the kernels
 
     begin(keys [4, lane], states [word, lane], lanes, 1)
     physics(states [word, lane], actions [step, word, lane], lanes, steps)
     """
     begin = function_of("reset", physics.begin, [("keys", KEY)], "states", target)
-    step = function_of("step", physics.step, [("states", physics.carry), ("actions", physics.action)], "states", target)
+    given = [("states", physics.carry), ("actions", physics.action)]
+    step = function_of("step", physics.step, given, "states", target, quick=quick)
     actions = Pointer("actions", words_of_step=words_in(physics.action))
     return [
-        begin,
-        step,
-        lane_function("begin", [Pointer("keys"), Pointer("states")], [Call(begin, ("keys", "states"))], target),
-        lane_function("physics", [Pointer("states"), actions], [Call(step, ("states", "actions"))], target),
+        *begin,
+        *step,
+        lane_function("begin", [Pointer("keys"), Pointer("states")], [Call(begin[-1], ("keys", "states"))], target),
+        lane_function("physics", [Pointer("states"), actions], [Call(step[-1], ("states", "actions"))], target),
     ]
 
 
@@ -124,7 +131,7 @@ def inputs_of(task: str) -> np.ndarray:
     return np.flatnonzero(~always_zero(make_environment(task, {})))
 
 
-def episode_functions(task: str, target: Target) -> list[FunctionBuilder]:
+def episode_functions(task: str, target: Target, *, quick: bool = False) -> list[FunctionBuilder]:
     """Functions of the kernels of training episodes, of all lanes at a time:
 
     begin(keys [4, lane], carries [word, lane], lanes, 1)
@@ -143,16 +150,16 @@ def episode_functions(task: str, target: Target) -> list[FunctionBuilder]:
         "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
     )
     given = [of_carry, of_constants, ("actions", outputs), ("action_keys", KEY)]
-    move = function_of("move", steps.advance, given, "carries", target, ["constants"])
+    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick)
     carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
-    sees = Call(see, ("carries", "constants", "seen"))
-    moves = Call(move, ("carries", "constants", "actions", "action_keys"))
+    sees = Call(see[-1], ("carries", "constants", "seen"))
+    moves = Call(move[-1], ("carries", "constants", "actions", "action_keys"))
     of_move = [carries, constants, Pointer("actions"), Pointer("action_keys"), seen]
     return [
-        reset,
-        see,
-        move,
-        lane_function("begin", [Pointer("keys"), carries], [Call(reset, ("keys", "carries"))], target),
+        *reset,
+        *see,
+        *move,
+        lane_function("begin", [Pointer("keys"), carries], [Call(reset[-1], ("keys", "carries"))], target),
         lane_function("look", [carries, constants, seen], [sees], target),
         lane_function("advance", of_move, [moves, sees], target),
     ]
@@ -206,11 +213,25 @@ FIVE = (*[jax.ShapeDtypeStruct((), jnp.float32)] * 3, *[jax.ShapeDtypeStruct((),
 """Shapes and dtypes of the arguments of `operations`."""
 
 
-def operation_functions(target: Target) -> list[FunctionBuilder]:
+def operation_functions(target: Target, *, quick: bool = False) -> list[FunctionBuilder]:
     """Functions of the kernel `operations(given [5, lane], found [word, lane], lanes, 1)`."""
-    function = function_of("compute", operations, [("given", one) for one in FIVE], "found", target)
+    functions = function_of("compute", operations, [("given", one) for one in FIVE], "found", target, quick=quick)
     pointers = [Pointer("given"), Pointer("found")]
-    return [function, lane_function("operations", pointers, [Call(function, ("given", "found"))], target)]
+    return [*functions, lane_function("operations", pointers, [Call(functions[-1], ("given", "found"))], target)]
+
+
+def division_functions(target: Target) -> list[FunctionBuilder]:
+    """Functions of the kernel `division(given [3, lane], found [2, lane], lanes, 1)`: a / b and the root of c."""
+    functions = function_of(
+        "divide",
+        lambda a, b, c: (a / b, jnp.sqrt(c)),
+        [("given", FIVE[0])] * 3,
+        "found",
+        target,
+        quick=True,
+    )
+    pointers = [Pointer("given"), Pointer("found")]
+    return [*functions, lane_function("division", pointers, [Call(functions[-1], ("given", "found"))], target)]
 
 
 def operation_arguments() -> np.ndarray:

@@ -13,9 +13,11 @@ import argparse
 import functools
 import importlib
 import json
+import lzma
 import os
 import statistics
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -30,8 +32,15 @@ PHYSICS = ("ant_trap", "ant_maze")
 """Tasks whose physics is compared and timed."""
 ACTIONS = 8
 """Numbers of an action of these tasks."""
-REGISTERS = (255, 168, 128, 96, 64)
-"""Limits of registers of a thread for which there is code."""
+VARIANTS = {
+    "255": (255, False),
+    "128": (128, False),
+    "quick_255": (255, True),
+    "quick_168": (168, True),
+    "quick_128": (128, True),
+    "quick_96": (96, True),
+}
+"""Code by name: (most registers of a thread, whether quotients are those of quick_division.py)."""
 ROLLOUTS = ("ant_maze", "ant_trap")
 """Tasks whose training episodes are compared and timed."""
 POLICIES = {"policy_1_2": 4, "policy_1_4": 4, "policy_2_2": 8, "policy_2_3": 8, "policy_4_1": 16}
@@ -77,11 +86,21 @@ class Results:
         self.file.flush()
 
 
+@functools.cache
+def unpacked(name: str) -> str:
+    """Path of a file of code, unpacked."""
+    folder = Path(tempfile.gettempdir()) / f"kernels_{os.getpid()}"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.cubin"
+    path.write_bytes(lzma.decompress((HERE / f"{name}.cubin.xz").read_bytes()))
+    return str(path)
+
+
 class Kernels:
     """The kernels of one file of code, called with arrays of the GPU and whole numbers."""
 
     def __init__(self, cupy: Any, name: str) -> None:
-        self.function = functools.cache(cupy.RawModule(path=str(HERE / f"{name}.cubin")).get_function)
+        self.function = functools.cache(cupy.RawModule(path=unpacked(name)).get_function)
 
     def __call__(self, name: str, arrays: Iterable[Any], lanes: int, steps: int = 1, block: int = 32) -> None:
         """Run a kernel with a thread for each lane."""
@@ -121,9 +140,34 @@ def compare_operations(cupy: Any, say: Results) -> None:
         wrong=wrong)  # fmt: skip
 
 
-def compare_physics(cupy: Any, say: Results, task: str, registers: int) -> None:
+def compare_division(cupy: Any, say: Results, lanes: int = 1 << 22) -> None:
+    """Compare quick quotients and roots with those of float64, rounded once, of ordinary numbers and of all."""
+    rng = np.random.default_rng(5)
+    kernels = Kernels(cupy, "division")
+    for what, low, high in (("ordinary", 107, 147), ("all", 0, 256)):
+        bits = rng.integers(0, 2**23, (3, lanes), dtype=np.uint32)
+        bits |= rng.integers(low, high, (3, lanes), dtype=np.uint32) << np.uint32(23)
+        bits[:2] |= rng.integers(0, 2, (2, lanes), dtype=np.uint32) << np.uint32(31)
+        given = bits.view(np.float32)
+        given[:, ::64] = rng.choice(np.array([0.0, -0.0, 1.0, 3.0], np.float32), (3, lanes // 64))
+        given[2] = np.abs(given[2])
+        a, b, c = (np.where(np.abs(x) < 2.0**-126, x * 0, x).astype(np.float64) for x in given)
+        with np.errstate(all="ignore"):
+            exact = np.stack([a / b, np.sqrt(c)])
+            wanted = np.where(np.abs(exact) < 2.0**-126 - 2.0**-151, exact * 0, exact).astype(np.float32)
+        found = cupy.empty((2, lanes), np.uint32)
+        kernels("division", [cupy.asarray(bits), found], lanes, block=128)
+        found = cupy.asnumpy(found)
+        wrong = without_nans(found) != without_nans(wanted.view(np.uint32))
+        first = [hex(word) for word in (*bits[:, lane], *found[:, lane])] if wrong.any() and (
+            lane := int(np.argmax(wrong.any(axis=0)))) >= 0 else None  # fmt: skip
+        say("division", what=what, lanes=lanes, quotients_wrong=int(wrong[0].sum()), roots_wrong=int(wrong[1].sum()),
+            first=first)  # fmt: skip
+
+
+def compare_physics(cupy: Any, say: Results, task: str, variant: str) -> None:
     """Compare a task's resets and control steps with those of the processor: all in single steps, and all in one."""
-    file, kernels = np.load(HERE / f"{task}.npz"), Kernels(cupy, f"{task}_{registers}")
+    file, kernels = np.load(HERE / f"{task}.npz"), Kernels(cupy, f"{task}_{variant}")
     digests = file["digests"]
     kept = dict(zip(file["numbers"].tolist(), file["states"], strict=True))
     steps, lanes = len(digests) - 1, digests.shape[1]
@@ -142,13 +186,13 @@ def compare_physics(cupy: Any, say: Results, task: str, registers: int) -> None:
     first = next((number for number, count in enumerate(wrong_lanes) if count), None)
     kernels("begin", [keys, states], lanes)
     kernels("physics", [states, actions], lanes, steps, block=64)
-    say("physics_bits", task=task, registers=registers, lanes=lanes, steps=steps, words=states.shape[0],
+    say("physics_bits", task=task, variant=variant, lanes=lanes, steps=steps, words=states.shape[0],
         words_wrong_after=wrong_words, first_wrong_step=first, lanes_wrong_at_end=wrong_lanes[-1],
         words_wrong_in_one_launch=differing(cupy.asnumpy(states), kept[steps]))  # fmt: skip
 
 
-def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], variants: Iterable[tuple[int, int]]) -> None:
-    """Time a task's control steps without policies; a variant is (limit of registers, threads of a block)."""
+def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], variants: Iterable[tuple[str, int]]) -> None:
+    """Time a task's control steps without policies; a variant is (name of the code, threads of a block)."""
     rng, file = np.random.default_rng(3), np.load(HERE / f"{task}.npz")
     few = physics_actions(STEPS_OF_LAUNCH, ACTIONS, 1024)
     variants = list(variants)
@@ -156,12 +200,12 @@ def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], varia
         actions = cupy.asarray(np.tile(few, (1, 1, lanes // 1024)))
         keys = cupy.asarray(rng.integers(0, 2**32, (4, lanes), dtype=np.uint32))
         states = cupy.asarray(np.zeros((len(file["states"][0]), lanes), np.uint32))
-        for registers, block in variants:
-            kernels = Kernels(cupy, f"{task}_{registers}")
+        for variant, block in variants:
+            kernels = Kernels(cupy, f"{task}_{variant}")
             kernels("begin", [keys, states], lanes)
             runs = seconds_of(cupy, kernels, "physics", [states, actions], lanes, STEPS_OF_LAUNCH, block)
             rates = [round(lanes * STEPS_OF_LAUNCH / run) for run in runs]
-            say("physics_speed", task=task, lanes=lanes, registers=registers, block=block,
+            say("physics_speed", task=task, lanes=lanes, variant=variant, block=block,
                 steps_per_s=round(statistics.median(rates)), us_per_step=round(
                     statistics.median(runs) / STEPS_OF_LAUNCH * 1e6, 1), runs=rates)  # fmt: skip
 
@@ -169,8 +213,8 @@ def time_physics(cupy: Any, say: Results, task: str, sizes: Iterable[int], varia
 class Rollout:
     """Training episodes of a task in a stream of the GPU's work: as many pairs as there are keys."""
 
-    def __init__(self, cupy: Any, task: str, file: Any, keys: tuple[np.ndarray, ...], registers: int = 255) -> None:
-        self.cupy, self.episodes = cupy, Kernels(cupy, f"{task}_episodes_{registers}")
+    def __init__(self, cupy: Any, task: str, file: Any, keys: tuple[np.ndarray, ...], variant: str = "255") -> None:
+        self.cupy, self.episodes = cupy, Kernels(cupy, f"{task}_episodes_{variant}")
         self.policies = Kernels(cupy, f"{task}_policy").function
         noise_keys, reset_keys, action_keys = keys
         self.pairs, self.members, self.unit = len(noise_keys), reset_keys.shape[1], np.float32(file["unit"])
@@ -249,7 +293,7 @@ def rollout_wrong(file: Any, words: np.ndarray, number: int) -> dict[str, int]:
     episode's result goes on in each kernel in its own way, and is not compared."""
     wanted = file["carries"][file["numbers"].tolist().index(number)]
     alive = wanted[int(file["alive_word"])] != 0
-    found = words[:, : wanted.shape[1]]
+    found, wanted, alive = (one[..., : words.shape[1]][..., : wanted.shape[1]] for one in (words, wanted, alive))
     result = slice(len(wanted) - int(file["episode_words"]), None)
     return {
         "alive": int(alive.sum()),
@@ -276,7 +320,7 @@ def compare_rollouts(cupy: Any, say: Results, task: str) -> None:
         with one.stream:
             one.decide()
         one.stream.synchronize()
-        wrong = differing(cupy.asnumpy(one.actions), file["actions"].view(np.uint32))
+        wrong = differing(cupy.asnumpy(one.actions), file["actions"])
         say("rollout_bits", task=task, what=policy, words_wrong=wrong, words=file["actions"].size)
     one.policy, done = "policy_2_2", 0
     for number in file["numbers"].tolist():
@@ -297,18 +341,18 @@ def time_rollouts(cupy: Any, say: Results, task: str, members: int, steps: int) 
             one.policy = policy
             alone[policy,] = min(seconds_of(cupy, one.decide, 10)) / 10
         best_policy = one.policy = min(POLICIES, key=lambda policy: alone[policy,])
-        for registers in REGISTERS:
-            one.episodes = Kernels(cupy, f"{task}_episodes_{registers}")
+        for variant in VARIANTS:
+            one.episodes = Kernels(cupy, f"{task}_episodes_{variant}")
             for block in (32, 64, 128):
                 one.block = block
-                alone[registers, block] = min(seconds_of(cupy, one.advance, 10)) / 10
-    registers, block = min((key for key in alone if len(key) == 2), key=alone.__getitem__)
+                alone[variant, block] = min(seconds_of(cupy, one.advance, 10)) / 10
+    variant, block = min((key for key in alone if len(key) == 2), key=alone.__getitem__)
     say("rollout_parts", task=task, members=members, us={"/".join(map(str, key)): round(1e6 * x, 1)
-        for key, x in alone.items()}, best=[best_policy, registers, block])  # fmt: skip
+        for key, x in alone.items()}, best=[best_policy, variant, block])  # fmt: skip
     del one
     for streams in (1, 2, 4):
         parts = [
-            Rollout(cupy, task, file, part, registers)
+            Rollout(cupy, task, file, part, variant)
             for part in zip(
                 *(np.split(whole, streams, axis=axis) for whole, axis in zip(keys, (0, 1, 1), strict=True)), strict=True
             )
@@ -318,7 +362,7 @@ def time_rollouts(cupy: Any, say: Results, task: str, members: int, steps: int) 
                 part.policy, part.block = policy, block
             rates = timed_rollouts(cupy, parts, steps)
             wrong = rollout_wrong(file, parts[0].words(), steps) if steps in file["numbers"] else None
-            say("rollout_speed", task=task, members=members, streams=streams, policy=policy, registers=registers,
+            say("rollout_speed", task=task, members=members, streams=streams, policy=policy, variant=variant,
                 block=block, steps=steps, **rates, compared=wrong)  # fmt: skip
 
 
@@ -359,12 +403,23 @@ def main() -> None:
     properties = cupy.cuda.runtime.getDeviceProperties(0)
     say("device", name=properties["name"].decode(), multiprocessors=properties["multiProcessorCount"],
         l2_bytes=properties["l2CacheSize"], driver=cupy.cuda.runtime.driverGetVersion())  # fmt: skip
-    every = [(registers, block) for registers in REGISTERS for block in (32, 64, 128)]
+    every = [(variant, block) for variant in VARIANTS for block in (32, 64, 128)]
     parts: list[Callable[[], None]] = [
         lambda: compare_operations(cupy, say),
-        *(lambda t=t, r=r: compare_physics(cupy, say, t, r) for t in PHYSICS for r in (255, 128)),
+        lambda: compare_division(cupy, say),
+        *(
+            lambda t=t, v=v: compare_physics(cupy, say, t, v)
+            for t in PHYSICS
+            for v in ("255", "quick_255", "quick_128")
+        ),
         lambda: time_physics(cupy, say, "ant_trap", (1024, 4096, 16384, 65536, 262144), every),
-        lambda: time_physics(cupy, say, "ant_maze", (1024, 8192, 16384, 65536), [(255, 32), (255, 64), (128, 64)]),
+        lambda: time_physics(
+            cupy,
+            say,
+            "ant_maze",
+            (1024, 8192, 16384, 65536),
+            [("255", 32), ("quick_255", 32), ("quick_255", 64), ("quick_128", 64)],
+        ),
     ]
     parts += [lambda t=t: compare_rollouts(cupy, say, t) for t in ROLLOUTS]
     parts += [

@@ -68,9 +68,10 @@ def words_of(tree) -> np.ndarray:
     return np.ascontiguousarray(pack(leaves, len(leaves[0]))[0])
 
 
+@pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
-def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, one: Target) -> None:
-    physics, functions = physics_of(task), physics_functions(physics_of(task), one)
+def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, quick: bool, one: Target) -> None:
+    physics, functions = physics_of(task), physics_functions(physics_of(task), one, quick=quick)
     rng, steps = np.random.default_rng(0), 5
     keys = rng.integers(0, 2**32, (LANES, 4), dtype=np.uint32)
     actions = rng.uniform(-1, 1, (steps, LANES, *physics.action.shape)).astype(np.float32)
@@ -85,13 +86,14 @@ def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, one: Target) 
     np.testing.assert_array_equal(without_nans(states), without_nans(words_of(carry)))
 
 
-def test_operations_of_single_lanes_have_the_bits_of_the_reference(one: Target) -> None:
+@pytest.mark.parametrize("quick", [False, True])
+def test_operations_of_single_lanes_have_the_bits_of_the_reference(quick: bool, one: Target) -> None:
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(operations)(*FIVE))
     given = operation_arguments()
     with np.errstate(invalid="ignore"):
         wanted = [np.asarray(x) for x in evaluate(graph, outputs, given)]
     found = np.zeros((len(wanted), given.shape[1]), np.uint32)
-    on_host(operation_functions(one), "operations")(given, found, given.shape[1], 1)
+    on_host(operation_functions(one, quick=quick), "operations")(given, found, given.shape[1], 1)
     for number, (ours, theirs) in enumerate(zip(found, wanted, strict=True)):
         theirs = theirs.astype(np.uint32) if theirs.dtype == bool else theirs
         np.testing.assert_array_equal(ours.view(theirs.dtype), theirs, err_msg=f"result {number}")
@@ -113,7 +115,7 @@ def test_a_product_and_a_sum_are_fused_only_where_the_graph_says() -> None:
     arguments = [("given", float_)] * 3
 
     def text(function) -> str:
-        made = function_of("f", function, arguments, "found", target_of("ptx"))
+        (made,) = function_of("f", function, arguments, "found", target_of("ptx"))
         pointers = [Pointer("given"), Pointer("found")]
         return ptx([made, lane_function("k", pointers, [Call(made, ("given", "found"))], target_of("ptx"))])
 

@@ -7,7 +7,7 @@ LLVM assigns all others to registers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.target import Target
@@ -52,6 +52,7 @@ def graph_function(
     out: str,
     target: Target,
     apart: Collection[str] = (),
+    writes: type[Writer] | None = None,
 ) -> FunctionBuilder:
     """Function `void name(ptr ...)` that computes a graph from words in memory.
 
@@ -61,6 +62,7 @@ def graph_function(
             words are read before any is written.
         apart: pointers whose words are not neighbours but `%lanes` words apart, as in [word, lane]. If there are any,
             `i64 %lanes` is the function's last parameter.
+        writes: what writes the instructions; `Writer` if None.
 
     Raises:
         UnsupportedError: more values are needed at the same time, or carried by loops, than fit on the stack.
@@ -73,11 +75,15 @@ def graph_function(
     for pointer, words in sources:
         input_addresses += [(f"%{pointer}", used[pointer] + word) for word in range(words)]
         used[pointer] += words
-    writer = _Writer(builder, graph, outputs, input_addresses, [f"%{pointer}" for pointer in apart])
+    writer = (writes or Writer)(builder, graph, outputs, input_addresses, [f"%{pointer}" for pointer in apart])
     writer.compute_all()
     stored = [writer.in_memory(node) for node in outputs]
-    for word, (llvm_type, value) in enumerate(stored):
-        builder.store(llvm_type, value, f"%{out}", writer.place(f"%{out}", word))
+
+    def write() -> None:
+        for word, (llvm_type, value) in enumerate(stored):
+            builder.store(llvm_type, value, f"%{out}", writer.place(f"%{out}", word))
+
+    writer.finish(write)
     if (live := builder.most_live()) > MOST_LIVE:
         raise UnsupportedError(f"{live:,} values are needed at the same time; simd supports at most {MOST_LIVE:,}")
     return builder
@@ -88,13 +94,13 @@ def inline(builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], given
 
     `given` has the names of the inputs' values, by node.
     """
-    writer = _Writer(builder, graph, outputs, [])
+    writer = Writer(builder, graph, outputs, [])
     writer.values.update(given)
     writer.compute_all()
     return [writer.value(node) for node in outputs]
 
 
-class _Writer:
+class Writer:
     """Writer of a graph's instructions into a function."""
 
     def __init__(
@@ -129,6 +135,10 @@ class _Writer:
         if self.slot_count:
             self.builder.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
 
+    def finish(self, write: Callable[[], object]) -> None:
+        """Write what follows the computation; `write` writes its results to memory."""
+        write()
+
     def region(self, region: Region) -> None:
         """Write straight code and the loops in it."""
         for step in region.steps:
@@ -149,15 +159,20 @@ class _Writer:
         before = self.values
 
         def trip(number: str, _: list[str]) -> list[str]:
-            self.values = {}
-            self.region(region)
-            values = [(loop.carries[k], self.in_memory(loop.outs[k])) for k in carried]
-            for carry, (llvm_type, value) in values:
-                self.builder.store(llvm_type, value, self.memory, self.slots[carry])
+            values = self.trip(region)
+            for k, (llvm_type, value) in zip(carried, values, strict=True):
+                self.builder.store(llvm_type, value, self.memory, self.slots[loop.carries[k]])
             return []
 
         self.builder.loop(loop.trips, trip)
         self.values = before
+
+    def trip(self, region: Region) -> list[tuple[str, str]]:
+        """Write the body of a loop; returns (LLVM type, name) of what each carry becomes."""
+        assert region.loop is not None
+        self.values = {}
+        self.region(region)
+        return [self.in_memory(region.loop.outs[k]) for k in region.carried]
 
     def compute(self, node: int) -> None:
         """Write the instruction of an operation."""
