@@ -215,6 +215,30 @@ def operation_files(folder: Path) -> None:
     )
 
 
+def straight_code(kib: int) -> str:
+    """PTX of the kernel `code(found [thread], threads, trips)`, whose loop is of fused products, KIB in all."""
+    registers = [f"%f{number}" for number in range(8)]
+    body = "\n".join(f"fma.rn.f32 {registers[k % 8]}, {registers[k % 8]}, %f8, %f9;" for k in range(64 * kib))
+    return f"""
+.version 7.8
+.target sm_90
+.address_size 64
+.visible .entry code(.param .u64 found, .param .u64 threads, .param .u64 trips) {{
+.reg .f32 %f<10>; .reg .b64 %d<4>; .reg .b32 %r<4>; .reg .pred %p;
+ld.param.u64 %d0, [found]; ld.param.u64 %d1, [trips];
+mov.u32 %r0, %tid.x; mov.u32 %r1, %ctaid.x; mov.u32 %r2, %ntid.x; mad.lo.s32 %r3, %r1, %r2, %r0;
+mul.wide.u32 %d2, %r3, 4; add.s64 %d0, %d0, %d2;
+mov.f32 %f8, 0f3F7FFFFE; cvt.rn.f32.s32 %f9, %r3;
+{" ".join(f"mov.f32 {one}, %f9;" for one in registers)}
+again:
+{body}
+add.s64 %d1, %d1, -1; setp.gt.s64 %p, %d1, 0; @%p bra again;
+{" ".join(f"add.f32 %f0, %f0, {one};" for one in registers[1:])}
+st.global.f32 [%d0], %f0; ret;
+}}
+"""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
@@ -224,6 +248,8 @@ def main() -> None:
     said["operations"] = assembled(folder, "operations", ptx(operation_functions(target)))
     operation_files(folder)
     said["division"] = assembled(folder, "division", ptx(division_functions(target)))
+    for kib in on_device.CODE_KIB:
+        assembled(folder, f"code_{kib}", straight_code(kib))
     for task in on_device.PHYSICS:
         text = {quick: ptx(physics_functions(physics_of(task), target, quick=quick)) for quick in (False, True)}
         for name, (registers, quick) in on_device.VARIANTS.items():

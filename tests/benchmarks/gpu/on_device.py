@@ -1,7 +1,7 @@
 """Run and time the kernels of `artefacts.py` on a GPU, unattended. It needs NumPy and CuPy only, and no other file of
 this repository but those in its folder.
 
-    python3 .gpu/ptx/on_device.py [--seconds 150]
+    python3 .gpu/ptx/on_device.py [--seconds 150] [PART ...]
 
 Each result is a line of JSON on stdout and in `ptx.jsonl` in the folder $OUT (here if it is not set). Bits are compared
 before anything is timed; a part that fails says so and the next one goes on. After --seconds the process ends itself.
@@ -46,8 +46,11 @@ ROLLOUTS = ("ant_maze", "ant_trap")
 POLICIES = {"policy_1_2": 4, "policy_1_4": 4, "policy_2_2": 8, "policy_2_3": 8, "policy_4_1": 16}
 """Kernels of policies -> pairs of a block."""
 STEPS_OF_LAUNCH = 50
-STEPS_OF_GRAPH = 20
+STEPS_OF_GRAPH = 25
+CODE_KIB = (32, 64, 96, 112, 128, 144, 160, 192, 256)
+"""Sizes of loops of products and sums, which show what a loop costs that the caches of code do not hold."""
 REPEATS = 3
+PARTS = ("operations", "physics_bits", "rollout_bits", "physics_speed", "rollout_speed", "code_speed")
 NAN = np.uint32(0x7FC00000)
 
 
@@ -151,8 +154,8 @@ def compare_division(cupy: Any, say: Results, lanes: int = 1 << 22) -> None:
         given = bits.view(np.float32)
         given[:, ::64] = rng.choice(np.array([0.0, -0.0, 1.0, 3.0], np.float32), (3, lanes // 64))
         given[2] = np.abs(given[2])
-        a, b, c = (np.where(np.abs(x) < 2.0**-126, x * 0, x).astype(np.float64) for x in given)
         with np.errstate(all="ignore"):
+            a, b, c = (np.where(np.abs(x) < 2.0**-126, x * 0, x).astype(np.float64) for x in given)
             exact = np.stack([a / b, np.sqrt(c)])
             wanted = np.where(np.abs(exact) < 2.0**-126 - 2.0**-151, exact * 0, exact).astype(np.float32)
         found = cupy.empty((2, lanes), np.uint32)
@@ -302,11 +305,11 @@ def rollout_wrong(file: Any, words: np.ndarray, number: int) -> dict[str, int]:
     }
 
 
-def compare_rollouts(cupy: Any, say: Results, task: str) -> None:
+def compare_rollouts(cupy: Any, say: Results, task: str, variant: str) -> None:
     """Compare noise, observations, outputs of each kernel of policies, and whole episodes with the processor's."""
     file = np.load(HERE / f"{task}_rollout.npz")
     members = file["reset_keys"].shape[1]
-    one = Rollout(cupy, task, file, rollout_keys(file, members))
+    one = Rollout(cupy, task, file, rollout_keys(file, members), variant)
     one.start()
     one.stream.synchronize()
     used = file["coordinates"] != 0
@@ -326,7 +329,14 @@ def compare_rollouts(cupy: Any, say: Results, task: str) -> None:
     for number in file["numbers"].tolist():
         one.run(number - done)
         done = number
-        say("rollout_bits", task=task, what="episodes", steps=number, **rollout_wrong(file, one.words(), number))
+        say(
+            "rollout_bits",
+            task=task,
+            variant=variant,
+            what="episodes",
+            steps=number,
+            **rollout_wrong(file, one.words(), number),
+        )
 
 
 def time_rollouts(cupy: Any, say: Results, task: str, members: int, steps: int) -> None:
@@ -391,10 +401,33 @@ def timed_rollouts(cupy: Any, parts: list[Rollout], steps: int) -> dict[str, Any
     return found
 
 
+def time_code(cupy: Any, say: Results) -> None:
+    """Time straight loops of products and sums by the size of their code, with 1 to 16 warps on a multiprocessor."""
+    count = cupy.cuda.runtime.getDeviceProperties(0)["multiProcessorCount"]
+    found = cupy.empty((count * 512,), np.float32)
+    for kib in CODE_KIB:
+        kernels, trips = Kernels(cupy, f"code_{kib}"), 5120 // kib
+        ns = {}
+        for warps in (1, 2, 4, 8, 16):
+            runs = seconds_of(cupy, kernels, "code", [found], count * 32 * warps, trips, 32 * warps)
+            ns[warps] = round(min(runs) * 1e9 / (trips * kib * 64), 3)
+        say("code_speed", kib=kib, ns_of_an_instruction_by_warps=ns)
+
+
+def profile(cupy: Any, task: str = "ant_maze", members: int = 8192) -> None:
+    """A few control steps, for a profiler."""
+    file = np.load(HERE / f"{task}_rollout.npz")
+    one = Rollout(cupy, task, file, rollout_keys(file, members), "quick_255")
+    one.start()
+    one.run(4)
+    one.stream.synchronize()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=150.0, help="the process ends itself after these")
-    seconds = parser.parse_args().seconds
+    parser.add_argument("parts", nargs="*", help="operations, physics_bits ..., in the order of the code; default: all")
+    seconds, names = (arguments := parser.parse_args()).seconds, arguments.parts or PARTS
     say = Results()
     watch = threading.Timer(seconds, lambda: (say("stopped", why=f"{seconds} s are over"), os._exit(3)))
     watch.daemon = True
@@ -404,32 +437,24 @@ def main() -> None:
     say("device", name=properties["name"].decode(), multiprocessors=properties["multiProcessorCount"],
         l2_bytes=properties["l2CacheSize"], driver=cupy.cuda.runtime.driverGetVersion())  # fmt: skip
     every = [(variant, block) for variant in VARIANTS for block in (32, 64, 128)]
-    parts: list[Callable[[], None]] = [
-        lambda: compare_operations(cupy, say),
-        lambda: compare_division(cupy, say),
-        *(
-            lambda t=t, v=v: compare_physics(cupy, say, t, v)
-            for t in PHYSICS
-            for v in ("255", "quick_255", "quick_128")
-        ),
-        lambda: time_physics(cupy, say, "ant_trap", (1024, 4096, 16384, 65536, 262144), every),
-        lambda: time_physics(
-            cupy,
-            say,
-            "ant_maze",
-            (1024, 8192, 16384, 65536),
-            [("255", 32), ("quick_255", 32), ("quick_255", 64), ("quick_128", 64)],
-        ),
-    ]
-    parts += [lambda t=t: compare_rollouts(cupy, say, t) for t in ROLLOUTS]
-    parts += [
-        lambda t=t, m=m, s=s: time_rollouts(cupy, say, t, m, s)
-        for t, m, s in (
-            ("ant_maze", 8192, 1000), ("ant_maze", 1024, 1000), ("ant_maze", 32768, 250), ("ant_trap", 8192, 250),
-        )
-    ]  # fmt: skip
+    few = [("255", 32), ("quick_255", 32), ("quick_255", 64), ("quick_128", 64)]
+    compared = "255", "quick_255", "quick_128"
+    rollouts = ("ant_maze", 8192, 1000), ("ant_maze", 1024, 1000), ("ant_maze", 32768, 250), ("ant_trap", 8192, 250)
+    parts: dict[str, list[Callable[[], None]]] = {
+        "operations": [lambda: compare_operations(cupy, say), lambda: compare_division(cupy, say)],
+        "physics_bits": [lambda t=t, v=v: compare_physics(cupy, say, t, v) for t in PHYSICS for v in compared],
+        "rollout_bits": [lambda t=t, v=v: compare_rollouts(cupy, say, t, v) for t in ROLLOUTS for v in compared[:2]],
+        "physics_speed": [
+            lambda: time_physics(cupy, say, "ant_trap", (1024, 4096, 16384, 65536), every),
+            lambda: time_physics(cupy, say, "ant_trap", (262144,), few),
+            lambda: time_physics(cupy, say, "ant_maze", (1024, 8192, 65536), few),
+        ],
+        "rollout_speed": [lambda t=t, m=m, s=s: time_rollouts(cupy, say, t, m, s) for t, m, s in rollouts],
+        "code_speed": [lambda: time_code(cupy, say)],
+        "profile": [lambda: profile(cupy)],
+    }
     failed = 0
-    for part in parts:
+    for part in [part for name in names for part in parts[name]]:
         try:
             part()
         except Exception as error:  # the other parts may work
