@@ -50,7 +50,7 @@ STEPS_OF_GRAPH = 25
 CODE_KIB = (32, 64, 96, 112, 128, 144, 160, 192, 256)
 """Sizes of loops of products and sums, which show what a loop costs that the caches of code do not hold."""
 REPEATS = 3
-PARTS = ("operations", "physics_bits", "rollout_bits", "physics_speed", "rollout_speed", "code_speed")
+PARTS = ("operations", "physics_bits", "rollout_bits", "rollout_speed", "physics_speed", "code_speed")
 NAN = np.uint32(0x7FC00000)
 
 
@@ -224,7 +224,7 @@ class Rollout:
         coordinates = file["coordinates"]
         self.stream = cupy.cuda.Stream(non_blocking=True)
         self.centre, self.constants, self.coordinates, self.noise_keys, self.reset_keys, self.action_keys = (
-            cupy.asarray(one)
+            cupy.asarray(np.ascontiguousarray(one))
             for one in (file["centre"], file["constants"], coordinates, noise_keys, reset_keys, action_keys)
         )
         self.noise = cupy.empty((self.pairs, len(coordinates)), np.uint8)

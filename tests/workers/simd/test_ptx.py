@@ -15,6 +15,7 @@ import pytest
 
 from tests.benchmarks.gpu.kernels import (
     FIVE,
+    division_functions,
     function_of,
     operation_arguments,
     operation_functions,
@@ -29,6 +30,7 @@ from workers.simd.backend.target import ISAS, Isa, Target, host_target, target_o
 from workers.simd.backend.words import pack
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.operations import compute
 from workers.simd.graph.reference import evaluate
 
 LANES = 21
@@ -99,15 +101,34 @@ def test_operations_of_single_lanes_have_the_bits_of_the_reference(quick: bool, 
         np.testing.assert_array_equal(ours.view(theirs.dtype), theirs, err_msg=f"result {number}")
 
 
-def test_every_float_instruction_rounds_to_nearest_and_flushes_denormal_numbers() -> None:
-    text = ptx(operation_functions(target_of("ptx")))
+def test_quick_quotients_and_roots_are_rounded_correctly_everywhere(one: Target) -> None:
+    rng = np.random.default_rng(0)
+    words = rng.integers(0, 2**32, (3, 100_000), dtype=np.uint32)  # every exponent, infinities and NaN
+    words[:, ::3] = rng.normal(size=words[:, ::3].shape).astype(np.float32).view(np.uint32)
+    words[:2, ::7] = rng.choice(np.array([0.0, -0.0, 1.0, -3.0], np.float32), words[:2, ::7].shape).view(np.uint32)
+    found = np.zeros((2, words.shape[1]), np.uint32)
+    on_host(division_functions(one), "division")(words, found, words.shape[1], 1)
+    a, b, c = words.view(np.float32)
+    with np.errstate(invalid="ignore"):
+        wanted = np.stack([compute("div", [a, b]), compute("sqrt", [c])])
+    np.testing.assert_array_equal(without_nans(found), without_nans(wanted.view(np.uint32)))
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_every_float_instruction_rounds_to_nearest_and_flushes_denormal_numbers(quick: bool) -> None:
+    text = ptx(operation_functions(target_of("ptx"), quick=quick))
     names = {match[1] for match in re.finditer(r"^\s+(?:@!?%p\d+ )?([a-z][\w.]*\.f32)\b", text, re.MULTILINE)}
-    arithmetic = {name for name in names if name.split(".")[0] in ("add", "sub", "mul", "fma", "div", "sqrt", "rcp")}
+    arithmetic = {
+        name
+        for name in names
+        if name.split(".")[0] in ("add", "sub", "mul", "fma", "div", "sqrt", "rcp") and "approx" not in name
+    }
     assert {name.split(".")[0] for name in arithmetic} >= {"add", "sub", "mul", "fma", "div", "sqrt"}
     assert all(name.split(".")[1:] == ["rn", "ftz", "f32"] for name in arithmetic)
     others = {name for name in names - arithmetic if name.split(".")[0] in ("setp", "cvt", "neg", "abs")}
     assert all("ftz" in name for name in others if name.count("f32") == 2 or not name.startswith("cvt"))
-    assert not {name for name in names if "approx" in name}
+    approximate = {name for name in names if "approx" in name}
+    assert approximate == ({"rcp.approx.ftz.f32", "rsqrt.approx.ftz.f32"} if quick else set())
 
 
 def test_a_product_and_a_sum_are_fused_only_where_the_graph_says() -> None:
