@@ -82,10 +82,12 @@ class EpisodeKernel:
             lane_L = np.flatnonzero(~wanted_L)
             carries[lane_L // self.network.width, self.alive_word, lane_L % self.network.width] = 0
         go(steps)
-        # The result of an episode is the last part of a carry.
+        return self.results(carries[:, -self.episode_words :], lanes).with_steps(self._steps_kept(kept, lanes))
+
+    def results(self, words: Words, lanes: int) -> Episodes:
+        """The results of episodes, [L], of the last words of their carries, [block, word, lane]."""
         leaves, structure = jax.tree.flatten(self.carry.episode)
-        found = structure.unflatten(unpack(carries[:, -self.episode_words :], leaves, lanes))
-        found = found.with_steps(self._steps_kept(kept, lanes))
+        found = structure.unflatten(unpack(words, leaves, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return found
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]

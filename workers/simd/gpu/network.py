@@ -1,0 +1,173 @@
+"""The policies of a whole population on a GPU: kernels of one layer, in which a thread has eight outputs of one pair.
+
+The weights of a pair are formed anew in each step, from the centre and a byte of noise, with the rounding that
+`episodes/hidden.py` and `episodes/network.py` describe; so outputs have the bits of those on processors. A thread
+computes both members of its pair, which share the noise. Neighbouring threads are neighbouring pairs: they read
+neighbouring words, and the same words of the centre.
+
+Memory:
+    seen, out   float32 [input or output, member]; members 2 p and 2 p + 1 are + and - of pair p
+    noises      bytes j + 128 of the noise k = 2 j + 1: [row, pair, TILE]
+    centre      float32 [row, TILE]
+A row is one input, or the bias, of a tile of TILE outputs: rows of a tile are its inputs and then its bias.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.noise import normal_integers
+from es_service.protocol.policy_spec import Activation, PolicySpec
+from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.backend.target import Target
+from workers.simd.episodes.hidden import activated, units
+
+TILE = 8
+"""Outputs of a thread, whose noise is one load of 64 bits."""
+BIAS_OF_BYTES = 128
+"""A byte is j plus this, so that it is not negative."""
+
+
+class GpuLayer(NamedTuple):
+    """A layer of the policy as a kernel."""
+
+    name: str
+    inputs: int
+    tiles: int
+    rows_of_tile: int
+    first: int
+    """Number of its first row."""
+    bias: bool
+    activation: Activation | None
+    is_last: bool
+
+    @property
+    def is_even(self) -> bool:
+        """Whether its number is even, for memory that layers use in turns."""
+        return self.name[-1] in "02468"
+
+
+def layers_of(policy: PolicySpec, inputs_O: NDArray[np.intp]) -> tuple[tuple[GpuLayer, ...], NDArray[np.uint32]]:
+    """Layers of a policy, and the places [row, TILE] of their weights in the flat vector of parameters.
+
+    Outputs beyond the last one of a layer have the place 0; nobody reads them.
+
+    Args:
+        inputs_O: inputs of the first layer that are computed; others are always zero.
+    """
+    layers, places, start, first, rows = [], [], 0, 0, inputs_O
+    for number, (inputs, outputs) in enumerate(policy.layers, 1):
+        is_last, tiles, of_tile = number == len(policy.layers), -(-outputs // TILE), len(rows) + policy.bias
+        weights = start + rows[:, None] * outputs + np.arange(outputs)
+        if policy.bias:
+            weights = np.concatenate([weights, start + inputs * outputs + np.arange(outputs)[None]])
+        padded = np.pad(weights, ((0, 0), (0, tiles * TILE - outputs)))
+        places.append(padded.reshape(of_tile, tiles, TILE).transpose(1, 0, 2).reshape(-1, TILE))
+        activation = ("tanh" if policy.output == "tanh" else None) if is_last else policy.activation
+        layers.append(GpuLayer(f"layer_{number}", len(rows), tiles, of_tile, first, policy.bias, activation, is_last))
+        start, first, rows = start + (inputs + policy.bias) * outputs, first + tiles * of_tile, np.arange(outputs)
+    return tuple(layers), np.concatenate(places).astype(np.uint32)
+
+
+def noise_bytes(key: Any, place_T: Any) -> Any:
+    """Two words with the bytes of the noise at the places of a row, from the stream key of a pair."""
+    j_T = ((normal_integers(jnp, key, place_T) - 1) >> 1) + BIAS_OF_BYTES
+    shifted_T = j_T.astype(jnp.uint32) << (8 * (jnp.arange(TILE, dtype=jnp.uint32) % 4))
+    first, second = shifted_T[:4], shifted_T[4:]
+    return jnp.stack([one[0] | one[1] | one[2] | one[3] for one in (first, second)])
+
+
+def fill_function(noise: FunctionBuilder, target: Target) -> FunctionBuilder:
+    """Function of the kernel `fill(keys [pair, 4], places [row, TILE], noises, pairs, threads)`.
+
+    Args:
+        noise: the function of `noise_bytes`, with all words of a lane in a row.
+    """
+    pointers = ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noises"]
+    builder = FunctionBuilder("fill_of_lane", [*pointers, "i64 %pairs", "i64 %lanes", "i64 %lane"], target)
+    row, pair = _row_and_pair(builder)
+    given = [
+        builder.at("%keys", builder.index((pair, 4)), "i32"),
+        builder.at("%places", builder.index((row, TILE)), "i32"),
+        builder.at("%noises", builder.index(("%lane", 2)), "i32"),
+    ]
+    builder.do(f"call void @{noise.name}({', '.join(f'ptr {one}' for one in given)})")
+    return builder
+
+
+def layer_function(layer: GpuLayer, target: Target) -> FunctionBuilder:
+    """Function of the kernel `NAME(seen, noises, centre, out, unit, pairs, threads)`, of tiles x pairs threads."""
+    pointers = [f"ptr noalias %{name}" for name in ("seen", "noises", "centre", "out")]
+    numbers = ["float %unit", "i64 %pairs", "i64 %lanes", "i64 %lane"]
+    builder = FunctionBuilder(f"{layer.name}_of_lane", [*pointers, *numbers], target)
+    floats, (unit, twice) = builder.llvm_types["f"], units(builder)
+    minus_unit, minus_twice = (builder.value(f"fneg {floats} {one}") for one in (unit, twice))
+    tile, pair = _row_and_pair(builder)
+    members, member = builder.index(("%pairs", 2)), builder.index((pair, 2))
+    first = builder.index((tile, layer.rows_of_tile), (layer.first, 1))
+    noises = builder.at("%noises", builder.value(f"add i64 {builder.value(f'mul i64 {first}, %pairs')}, {pair}"), "i64")
+    centre, seen = builder.at("%centre", builder.index((first, TILE)), "float"), builder.at("%seen", member, "float")
+
+    def weights_of(row: str | int) -> Values:
+        """Weights of both members, [output, sign]."""
+        j_T = _noise(builder, builder.at(noises, builder.value(f"mul i64 {row}, %pairs"), "i64"))
+        found = []
+        for j, c in zip(j_T, _vector(builder, builder.at(centre, builder.index((row, TILE)), "float"), 4), strict=True):
+            plus = builder.fma(j, twice, builder.value(f"fadd {floats} {c}, {unit}"))
+            if layer.is_last:
+                minus = builder.fma(j, minus_twice, builder.value(f"fadd {floats} {c}, {minus_unit}"))
+            else:
+                minus = builder.value(f"fsub {floats} {builder.value(f'fadd {floats} {c}, {c}')}, {plus}")
+            found += [plus, minus]
+        return found
+
+    def add(row: str, sums: Values) -> Values:
+        x_S = _vector(builder, builder.at(seen, builder.value(f"mul i64 {row}, {members}"), "float"), 2, 1)
+        return [builder.fma(x_S[k % 2], w, s) for k, (w, s) in enumerate(zip(weights_of(row), sums, strict=True))]
+
+    begin = weights_of(layer.inputs) if layer.bias else ["zeroinitializer"] * 2 * TILE
+    sums = builder.loop(layer.inputs, add, [(floats, one) for one in begin])
+    if layer.activation is not None:
+        sums = activated(builder, layer.activation, sums)
+    out = builder.at("%out", member, "float")
+    for k, value in enumerate(sums):
+        output = builder.index((tile, TILE), (k // 2, 1))
+        builder.store(floats, value, builder.at(out, builder.value(f"mul i64 {output}, {members}"), "float"), k % 2)
+    return builder
+
+
+def _row_and_pair(builder: FunctionBuilder) -> tuple[str, str]:
+    """Numbers of a thread's row, or tile, and pair."""
+    return builder.value("udiv i64 %lane, %pairs"), builder.value("urem i64 %lane, %pairs")
+
+
+def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE // 4) -> Values:
+    """Neighbouring floats in memory, each as a vector of one lane, by loads of `size`."""
+    found, whole = [], f"<{size} x float>"
+    for number in range(loads):
+        place = builder.at(pointer, number, whole)
+        loaded = builder.value(f"load {whole}, ptr {place}, align {4 * size}")
+        for k in range(size):
+            found.append(builder.value(f"shufflevector {whole} {loaded}, {whole} poison, <1 x i32> <i32 {k}>"))
+    return found
+
+
+def _noise(builder: FunctionBuilder, pointer: str) -> Values:
+    """The noise j of a row of a tile as floats: the difference of 2^23 + byte, which needs no conversion, and of 2^23
+    plus the bias of bytes. Both are exact."""
+    floats, word = builder.llvm_types["f"], builder.value(f"load i64, ptr {pointer}, align 8")
+    halves = [builder.value(f"trunc i64 {one} to i32") for one in (word, builder.value(f"lshr i64 {word}, 32"))]
+    offset = struct.pack(">d", -(2.0**23 + BIAS_OF_BYTES)).hex().upper()
+    found = []
+    for k in range(TILE):
+        shifted = builder.value(f"lshr i32 {halves[k // 4]}, {8 * (k % 4)}")
+        byte = builder.value(f"and i32 {shifted}, 255")
+        bits = builder.value(f"or i32 {byte}, {0x4B000000}")
+        number = builder.value(f"bitcast i32 {bits} to {floats}")
+        found.append(builder.value(f"fadd {floats} {number}, splat (float 0x{offset})"))
+    return found
