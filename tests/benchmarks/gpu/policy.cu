@@ -8,7 +8,7 @@
 // Bytes j + 128 of the noise of a pair, whose coordinates artefacts.py lists in this order:
 //     each hidden layer   [input / 4, output / 4, input % 4, output % 4], then biases [output]
 //     last layer          [output, input], then biases [output]
-// Floats of the centre: each hidden layer [input, output], biases [output]; last layer [output, input], biases [output].
+// Floats of the centre: hidden layers [input, output], biases [output]; last layer [output, input], biases [output].
 //
 // A thread computes four neighbouring outputs of both members of PAIRS pairs, 64 threads a hidden layer, and a block of
 // 256 threads has 4 * PAIRS pairs, which read the same row of the centre at about the same time.
@@ -24,10 +24,9 @@ constexpr int SECOND = noise_of(INPUTS), LAST = SECOND + noise_of(WIDTH);
 constexpr int NOISE = (LAST + OUTPUTS * WIDTH + OUTPUTS + 127) / 128 * 128;
 constexpr int CENTRE_2 = (INPUTS + 1) * WIDTH, CENTRE_3 = CENTRE_2 + (WIDTH + 1) * WIDTH;
 
-// The noise j in byte `place` of a word.
-__device__ __forceinline__ float noise(uint32_t word, int place) {
-    // 2^23 + byte, without a conversion; the difference is exact.
-    return __fadd_rn(__uint_as_float(__byte_perm(word, 0x4B000000u, 0x7440 | place)), -8388736.0f);
+// The noise j in byte `place` of a word: the difference of 2^23 + byte, which needs no conversion, and 2^23 + 128.
+__device__ __forceinline__ float noise(uint32_t word, int place, uint32_t two_to_23) {
+    return __fadd_rn(__uint_as_float(__byte_perm(word, two_to_23, 0x7440 | place)), -8388736.0f);
 }
 
 __device__ __forceinline__ uint32_t word_of(const uint4& words, int k) {
@@ -57,23 +56,23 @@ __device__ __forceinline__ float tanh_of(float x) {
 // Add the products of one input, or of the bias with x = 1, to the sums [pair, member, output].
 template <int PAIRS, bool BIAS>
 __device__ __forceinline__ void add(float (&sums)[PAIRS][2][4], const float4& centre, const uint32_t (&words)[PAIRS],
-                                    const float (&x)[PAIRS][2], float unit, float twice) {
+                                    const float (&x)[PAIRS][2], float unit, float twice, uint32_t two_to_23) {
 #pragma unroll
     for (int o = 0; o < 4; o++) {
         const float c = part_of(centre, o), moved = __fadd_rn(c, unit), doubled = __fadd_rn(c, c);
 #pragma unroll
         for (int p = 0; p < PAIRS; p++) {
-            const float plus = __fmaf_rn(noise(words[p], o), twice, moved), minus = __fsub_rn(doubled, plus);
+            const float plus = __fmaf_rn(noise(words[p], o, two_to_23), twice, moved), minus = __fsub_rn(doubled, plus);
             sums[p][0][o] = BIAS ? plus : __fmaf_rn(x[p][0], plus, sums[p][0][o]);
             sums[p][1][o] = BIAS ? minus : __fmaf_rn(x[p][1], minus, sums[p][1][o]);
         }
     }
 }
 
-// A hidden layer of PAIRS pairs, four outputs of a thread: x [pair, member, STRIDE] in shared memory becomes the outputs.
+// A hidden layer of PAIRS pairs, four outputs of a thread; x [pair, member, STRIDE] in shared memory becomes them.
 template <int ROWS, int PAIRS>
 __device__ __forceinline__ void hidden(const uint8_t* const (&bytes)[PAIRS], const float* centre, float* x,
-                                       float unit, float twice, int quad) {
+                                       float unit, float twice, uint32_t two_to_23, int quad) {
     constexpr int WHOLE = ROWS / 4, ALL = groups_of(ROWS);
     const float4* rows = reinterpret_cast<const float4*>(centre) + quad;
     float sums[PAIRS][2][4], seen[PAIRS][2];
@@ -88,7 +87,7 @@ __device__ __forceinline__ void hidden(const uint8_t* const (&bytes)[PAIRS], con
     for (int p = 0; p < PAIRS; p++)
         words[p] = __ldcs(reinterpret_cast<const uint32_t*>(bytes[p] + ALL * 4 * WIDTH) + quad);
     float4 next = __ldg(rows);
-    add<PAIRS, true>(sums, __ldg(rows + ROWS * QUADS), words, seen, unit, twice);
+    add<PAIRS, true>(sums, __ldg(rows + ROWS * QUADS), words, seen, unit, twice, two_to_23);
 
 #pragma unroll 1
     for (int first = 0; first < WHOLE; first += DEPTH) {
@@ -111,7 +110,7 @@ __device__ __forceinline__ void hidden(const uint8_t* const (&bytes)[PAIRS], con
                         words[p] = word_of(ahead[d][p], r);
                         seen[p][0] = part_of(four[p][0], r), seen[p][1] = part_of(four[p][1], r);
                     }
-                    add<PAIRS, false>(sums, now, words, seen, unit, twice);
+                    add<PAIRS, false>(sums, now, words, seen, unit, twice, two_to_23);
                 }
 #pragma unroll
                 for (int p = 0; p < PAIRS; p++)
@@ -129,7 +128,7 @@ __device__ __forceinline__ void hidden(const uint8_t* const (&bytes)[PAIRS], con
             words[p] = word_of(ahead[WHOLE % DEPTH][p], r);
             seen[p][0] = x[(2 * p) * STRIDE + 4 * WHOLE + r], seen[p][1] = x[(2 * p + 1) * STRIDE + 4 * WHOLE + r];
         }
-        add<PAIRS, false>(sums, now, words, seen, unit, twice);
+        add<PAIRS, false>(sums, now, words, seen, unit, twice, two_to_23);
     }
     __syncthreads();  // all have read x
 #pragma unroll
@@ -143,12 +142,13 @@ __device__ __forceinline__ void hidden(const uint8_t* const (&bytes)[PAIRS], con
 }
 
 // One output of one member, from x in shared memory.
-__device__ __forceinline__ float last(const uint8_t* bytes, const float* centre, const float* x, float unit, int output) {
+__device__ __forceinline__ float last(const uint8_t* bytes, const float* centre, const float* x, float unit,
+                                      uint32_t two_to_23, int output) {
     const float twice = __fadd_rn(unit, unit);
     const uint4* noises = reinterpret_cast<const uint4*>(bytes + output * WIDTH);
     const float4* weights = reinterpret_cast<const float4*>(centre + output * WIDTH);
     const uint32_t bias = bytes[OUTPUTS * WIDTH + output];
-    float sum = __fmaf_rn(noise(bias, 0), twice, __fadd_rn(__ldg(centre + OUTPUTS * WIDTH + output), unit));
+    float sum = __fmaf_rn(noise(bias, 0, two_to_23), twice, __fadd_rn(__ldg(centre + OUTPUTS * WIDTH + output), unit));
     uint4 ahead[DEPTH];
 #pragma unroll
     for (int d = 0; d < DEPTH; d++) ahead[d] = __ldcs(noises + d);
@@ -164,7 +164,8 @@ __device__ __forceinline__ float last(const uint8_t* bytes, const float* centre,
                 const float4 c = __ldg(weights + place), seen = reinterpret_cast<const float4*>(x)[place];
 #pragma unroll
                 for (int r = 0; r < 4; r++) {
-                    const float weight = __fmaf_rn(noise(word_of(now, k), r), twice, __fadd_rn(part_of(c, r), unit));
+                    const float moved = __fadd_rn(part_of(c, r), unit);
+                    const float weight = __fmaf_rn(noise(word_of(now, k), r, two_to_23), twice, moved);
                     sum = __fmaf_rn(part_of(seen, r), weight, sum);
                 }
             }
@@ -181,6 +182,8 @@ __device__ __forceinline__ void policy(const float* seen, const uint8_t* noises,
     __shared__ __align__(16) float x[OF_BLOCK * 2 * STRIDE];
     const int thread = threadIdx.x, group = thread / QUADS, quad = thread % QUADS, start = blockIdx.x * OF_BLOCK;
     const float twice = __fadd_rn(unit, unit);
+    // The bits of 2^23, as a value that the compiler keeps in a register instead of making it anew for each byte.
+    const uint32_t two_to_23 = 0x4B000000u | ((uint32_t)pairs >> 31);
     for (int place = thread; place < INPUTS * OF_BLOCK * 2; place += THREADS) {
         const int member = place % (OF_BLOCK * 2), input = place / (OF_BLOCK * 2);
         x[member * STRIDE + input] = seen[(int64_t)input * 2 * pairs + min(2 * start + member, 2 * pairs - 1)];
@@ -190,16 +193,16 @@ __device__ __forceinline__ void policy(const float* seen, const uint8_t* noises,
 #pragma unroll
     for (int p = 0; p < PAIRS; p++) bytes[p] = noises + (int64_t)min(start + group * PAIRS + p, pairs - 1) * NOISE;
     float* mine = x + group * PAIRS * 2 * STRIDE;
-    hidden<INPUTS, PAIRS>(bytes, centre, mine, unit, twice, quad);
+    hidden<INPUTS, PAIRS>(bytes, centre, mine, unit, twice, two_to_23, quad);
 #pragma unroll
     for (int p = 0; p < PAIRS; p++) bytes[p] += SECOND;
-    hidden<WIDTH, PAIRS>(bytes, centre + CENTRE_2, mine, unit, twice, quad);
+    hidden<WIDTH, PAIRS>(bytes, centre + CENTRE_2, mine, unit, twice, two_to_23, quad);
     for (int place = thread; place < OF_BLOCK * 2 * OUTPUTS; place += THREADS) {
         const int output = place % OUTPUTS, member = place / OUTPUTS, pair = start + member / 2;
         if (pair < pairs)
             action[(int64_t)output * 2 * pairs + 2 * start + member] =
                 last(noises + (int64_t)pair * NOISE + LAST, centre + CENTRE_3, x + member * STRIDE,
-                     member % 2 ? -unit : unit, output);
+                     member % 2 ? -unit : unit, two_to_23, output);
     }
 }
 
