@@ -327,6 +327,13 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
         for name in faster
         if task.kind in rollouts[name].task_kinds and (why := why_not(rollouts[name], task, shape, here=here))
     ]
+    has_pairs = isinstance(config.search, PopulationConfig)
+    if config.compute.worker_resources.gpu and chosen == "simd" and not has_pairs:
+        method = config.search.algorithm
+        warnings.append(
+            f"{RESOURCES}gpu: {method} has no training episodes, which are what simd computes on a GPU; the rest is "
+            "computed on the CPU"
+        )
     pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
     if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].pair_limits(task)[0]) and pairs > MOST_CHUNK_PAIRS:

@@ -36,6 +36,11 @@ def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dic
     return kept | threads | GPU_SETTINGS | {"XLA_CLIENT_MEM_FRACTION": f"{GPU_MEMORY_FRACTION * min(gpus, 1.0):g}"}
 
 
+def on_gpu() -> bool:
+    """Whether this process is a worker that has been given a GPU."""
+    return os.environ.get("JAX_PLATFORMS") == GPU_SETTINGS["JAX_PLATFORMS"]
+
+
 def same_imports() -> dict[str, str]:
     """Environment variables with which a child process imports from the same places as this process.
 

@@ -1,4 +1,4 @@
-"""The rollout `simd`: our compiler makes machine code of a task's functions (`workers/simd`), for CPUs."""
+"""The rollout `simd`: our compiler makes machine code of a task's functions (`workers/simd`), for CPUs and GPUs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from functools import cache
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
+from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.policy_spec import PolicySpec
+from es_service.protocol.process_environment import on_gpu
 from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
@@ -15,10 +17,15 @@ from workers.rollouts.backend import ChunkFunctions, RolloutBackend
 
 
 class Simd(RolloutBackend):
-    """Whole episodes as vector code, in which each lane is one environment."""
+    """Whole episodes as vector code, in which each lane is one environment.
+
+    A worker with a GPU computes training episodes there, one environment a thread, and all else on its core: the bits
+    are the same.
+    """
 
     name = "simd"
     runs_in_threads = True
+    runs_on_gpus = True
     takes_chunks_together = True
     compile_s = (10, 4)
 
@@ -42,13 +49,29 @@ class Simd(RolloutBackend):
         """The functions of `workers.simd.episodes.rollout`."""
         from workers.simd.episodes import rollout
 
+        gpu = on_gpu()
+        if gpu:
+            import jax
+
+            jax.config.update("jax_platforms", "cpu")  # JAX only traces here, and need not know the GPU
         environment = environments.make_environment(spec.environment, spec.environment_options)
+        elsewhere = None
+        if gpu and not set(spec.outputs) & set(OF_STEPS):  # which the code for GPUs does not keep
+            from workers.simd.gpu.rollout import episodes_on_gpu
+
+            elsewhere = episodes_on_gpu(environment, spec)
         return ChunkFunctions(
-            rollout.make_training_rollout(environment, spec),
+            rollout.make_training_rollout(environment, spec, elsewhere),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
             rollout.make_gradient_sum(spec.policy.parameters),
         )
+
+    def device(self) -> str:
+        """The kind of the GPU."""
+        from workers.simd.gpu.driver import the_gpu
+
+        return the_gpu().name
 
     def made(self, recipes: Recipes) -> FloatArray:
         """Those of one kernel."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
+from es_service.protocol.process_environment import on_gpu
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
 from workers.rollouts.backend import ChunkFunctions, RolloutBackend
@@ -31,11 +32,11 @@ class Xla(RolloutBackend):
         from workers.scatters import without_scatters
 
         environment = environments.make_environment(spec.environment, spec.environment_options)
-        if on_gpu := _on_gpu():
+        if gpu := on_gpu():
             reset, step = without_scatters(environment.reset), without_scatters(environment.step)
             environment = replace(environment, reset=reset, step=step)
         return ChunkFunctions(
-            rollout.make_training_rollout(environment, spec, in_pairs=on_gpu),
+            rollout.make_training_rollout(environment, spec, in_pairs=gpu),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
             rollout.make_gradient_sum(spec.policy.parameters),
@@ -57,10 +58,3 @@ class Xla(RolloutBackend):
         from workers.rollouts.jax_tasks import random_steps
 
         return random_steps(lambda episode, *_: jax.jit(jax.vmap(episode)), task, options, batch, steps)
-
-
-def _on_gpu() -> bool:
-    """Whether JAX computes on a GPU."""
-    import jax
-
-    return jax.default_backend() == "gpu"

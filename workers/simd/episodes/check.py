@@ -88,18 +88,19 @@ def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> 
     require_same(gradient_sum(weights_P, keys_P)[:parameters], wanted_D, "a gradient")
 
 
-def require_same(found: np.ndarray, wanted: np.ndarray, what: str) -> None:
+def require_same(found: np.ndarray, wanted: np.ndarray, what: str, where: str = "this processor") -> None:
     """Raise WrongCodeError unless two arrays have the same bits; all NaN count as the same.
 
     Args:
         what: what the arrays are, for the message.
+        where: what the code is for.
     """
     found, wanted = (np.ascontiguousarray(x).view(np.uint32) for x in (found, wanted))
     nan = np.isnan(found.view(np.float32)) & np.isnan(wanted.view(np.float32))
     differing = np.count_nonzero((found != wanted) & ~nan)
     if differing:
         raise WrongCodeError(
-            f"simd's machine code for this processor is wrong: {differing:,} of {found.size:,} words of {what} differ "
+            f"simd's machine code for {where} is wrong: {differing:,} of {found.size:,} words of {what} differ "
             "from their definition. Please report this with the output of es-service doctor; until it is mended, set "
             "compute.rollout to xla"
         )

@@ -17,7 +17,7 @@ from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
-from workers.episode import Carry, Episodes
+from workers.episode import Carry
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.backend.words import aligned, require
@@ -29,7 +29,6 @@ from workers.simd.episodes.variation import make_variation
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.unsupported import UnsupportedError, fault
 
-RunEpisodes = Callable[..., Episodes]
 KEPT_PACKED = 4
 """Number of centres whose packed weights are kept, for work items that share centres."""
 
@@ -69,13 +68,13 @@ def why_not(task: TaskSpec) -> str:
 
 
 def make_training_rollout(
-    environment: Environment, spec: WorkerSpec, run_elsewhere: RunEpisodes | None = None
+    environment: Environment, spec: WorkerSpec, elsewhere: Compilable | None = None
 ) -> Compilable:
     """Rollout of one training chunk, with the interface of `workers.rollout.make_training_rollout`.
 
     Args:
-        run_elsewhere: function (kernel, centre_D, arguments of `EpisodeKernel.run` after the weights) -> Episodes with
-            the same bits, which is called in its place.
+        elsewhere: function (kernel, centre_D, arguments of `EpisodeKernel.run` after the weights) -> Episodes with the
+            same bits, which is called in its place; its `compile` takes a kernel.
     """
     kernels = _Kernels(environment, spec, training=True)
 
@@ -86,16 +85,17 @@ def make_training_rollout(
             keys = (keys_P_S_E[:, :, episode] for keys_P_S_E in (reset_keys_P_S_E, action_keys_P_S_E))
             lanes = (keys_P_S.reshape(-1, KEY_WORDS) for keys_P_S in keys)
             given = (unit, mean_O, std_O, noise_keys_P, *lanes)
-            by_episode.append(
-                kernel.run(weights, *given) if run_elsewhere is None else run_elsewhere(kernel, centre_D, *given)
-            )
+            by_episode.append(kernel.run(weights, *given) if elsewhere is None else elsewhere(kernel, centre_D, *given))
         axes = (len(noise_keys_P), 2, spec.episodes_per_member)
         if len(by_episode) == 1:
             return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), by_episode[0])
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]), *by_episode)
 
     def compile_for(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
-        kernels.fitting(mean_O).begin.compile(reset_keys_P_S_E[:, :, 0].reshape(-1, KEY_WORDS))
+        kernel = kernels.fitting(mean_O)
+        kernel.begin.compile(reset_keys_P_S_E[:, :, 0].reshape(-1, KEY_WORDS))
+        if elsewhere is not None:
+            elsewhere.compile(kernel)
 
     return Compilable(rollout, compile_for)
 

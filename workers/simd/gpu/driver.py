@@ -9,6 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from workers.simd.backend.function_builder import FunctionBuilder
+from workers.simd.backend.ptx import ptx
+from workers.simd.backend.target import Target, target_of
+
 LIBRARY = "libcuda.so.1"
 THREADS = 128
 """Threads of a block of all kernels."""
@@ -51,19 +55,25 @@ class Gpu:
         """Use the GPU in this thread."""
         self._call("cuCtxSetCurrent", self._context)
 
-    def module(self, ptx: str) -> Module:
-        """Compile PTX for this GPU. The driver keeps what it has compiled in a folder of the user.
+    @property
+    def target(self) -> Target:
+        """What functions for it are built for."""
+        return target_of("ptx")
+
+    def module(self, functions: Sequence[FunctionBuilder]) -> Module:
+        """Compile the kernels of functions, see `ptx.ptx`. The driver keeps what it has compiled in a folder of the
+        user.
 
         Raises:
-            GpuError: the driver refuses it; its messages are in the error.
+            GpuError: the driver refuses them; its messages are in the error.
         """
+        text = ctypes.c_char_p(ptx(functions).encode())
         module, log = ctypes.c_void_p(), ctypes.create_string_buffer(LOG_BYTES)
         options = (ctypes.c_int * 2)(ERROR_LOG, ERROR_LOG_BYTES)
         values = (ctypes.c_void_p * 2)(ctypes.cast(log, ctypes.c_void_p), LOG_BYTES)
         try:
             self._call(
-                "cuModuleLoadDataEx", ctypes.byref(module), ctypes.c_char_p(ptx.encode()), ctypes.c_uint(2), options,
-                values,
+                "cuModuleLoadDataEx", ctypes.byref(module), text, ctypes.c_uint(2), options, values
             )  # fmt: skip
         except GpuError as error:
             raise GpuError(f"{error}: {log.value.decode(errors='replace').strip()}") from None

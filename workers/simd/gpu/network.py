@@ -152,8 +152,8 @@ def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE
     for number in range(loads):
         place = builder.at(pointer, number, whole)
         loaded = builder.value(f"load {whole}, ptr {place}, align {4 * size}")
-        for k in range(size):
-            found.append(builder.value(f"shufflevector {whole} {loaded}, {whole} poison, <1 x i32> <i32 {k}>"))
+        one = f"shufflevector {whole} {loaded}, {whole} poison, <1 x i32>"
+        found += [builder.value(f"{one} <i32 {k}>") for k in range(size)]
     return found
 
 

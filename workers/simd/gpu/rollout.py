@@ -7,20 +7,26 @@ import threading
 from ctypes import c_float, c_int64
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import Keys
+from workers.compilable import Compilable
 from workers.environments import Environment
-from workers.simd.backend.ptx import ptx
-from workers.simd.backend.target import target_of
+from workers.rollouts.backend import Episodes
+from workers.simd.episodes.check import require_same
 from workers.simd.episodes.compiled import EpisodeKernel
 from workers.simd.gpu.driver import Gpu, GpuArray, Module, the_gpu
 from workers.simd.gpu.network import TILE, GpuLayer, layers_of
 from workers.simd.gpu.program import episode_functions
 
 STEPS_BETWEEN_LOOKS = 25
-"""Control steps after which the processor looks whether any episode goes on; each look costs about as much as a step."""
+"""Control steps after which the processor looks whether any episode goes on; it costs some tens of microseconds."""
+
+
+CHECKED = 8
+"""Pairs whose episodes are compared with those of the processor, when code is new to this process."""
 
 
 class _Room(NamedTuple):
@@ -40,28 +46,40 @@ class _Program(NamedTuple):
     places: np.ndarray
     on_gpu: GpuArray
     """The places."""
+    checked: list[bool]
+    """Not empty once results have been compared with those of the processor."""
+
+
+def episodes_on_gpu(environment: Environment, spec: WorkerSpec, gpu: Gpu | None = None) -> Compilable:
+    """Function that runs training episodes on a GPU, as `make_training_rollout` takes it.
+
+    Args:
+        gpu: None for that of this process.
+
+    Raises GpuError as `Gpu`.
+    """
+    episodes = GpuEpisodes(environment, spec, gpu or the_gpu())
+    return Compilable(episodes.run, lambda kernel: episodes.program(kernel.inputs_O))
 
 
 class GpuEpisodes:
     """Runs the training episodes of a run. Threads take turns."""
 
-    def __init__(self, environment: Environment, spec: WorkerSpec, gpu: Gpu | None = None) -> None:
-        """Prepare them; kernels are compiled when they are needed.
-
-        Raises GpuError as `Gpu`.
-        """
-        self._environment, self._spec, self._gpu = environment, spec, gpu or the_gpu()
+    def __init__(self, environment: Environment, spec: WorkerSpec, gpu: Gpu) -> None:
+        """Prepare them; kernels are compiled when they are needed."""
+        self._environment, self._spec, self._gpu = environment, spec, gpu
         self._programs: dict[bytes, _Program] = {}
         self._rooms: dict[tuple[bytes, int], _Room] = {}
         self._lock = threading.Lock()
 
     def program(self, inputs_O: np.ndarray) -> _Program:
-        """The kernels for a choice of inputs, compiled at the first call."""
+        """The kernels for a choice of inputs, compiled at the first call. Raises GpuError as `Gpu.module`."""
+        self._gpu.enter()
         key = inputs_O.tobytes()
         if key not in self._programs:
             layers, places = layers_of(self._spec.policy, inputs_O)
-            text = ptx(episode_functions(self._environment, self._spec, inputs_O, target_of("ptx")))
-            self._programs[key] = _Program(self._gpu.module(text), layers, places, self._gpu.copied(places))
+            functions = episode_functions(self._environment, self._spec, inputs_O, self._gpu.target)
+            self._programs[key] = _Program(self._gpu.module(functions), layers, places, self._gpu.copied(places), [])
         return self._programs[key]
 
     def run(
@@ -74,40 +92,68 @@ class GpuEpisodes:
         noise_keys_P: Keys,
         reset_keys_L: Keys,
         action_keys_L: Keys,
-    ) -> Any:
-        """Episodes [L] of both members of each pair, as `EpisodeKernel.run` of the kernel with the same arguments."""
+    ) -> Episodes:
+        """Episodes [L] of both members of each pair, as `EpisodeKernel.run` of the kernel with the same arguments.
+
+        Raises WrongCodeError if new code does not compute the first episodes as the processor does.
+        """
+        given = (centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
         with self._lock:
-            self._gpu.enter()
-            inputs_O, pairs = kernel.inputs_O, len(noise_keys_P)
-            program, lanes = self.program(inputs_O), 2 * len(noise_keys_P)
-            room = self._room(program, inputs_O, pairs)
-            resets = kernel.begin(reset_keys_L)
-            words = np.concatenate(list(resets), axis=1)[:, :lanes]
-            carries, constants, centre, keys, action_keys = map(
-                self._gpu.copied,
-                (
-                    np.ascontiguousarray(words),
-                    np.concatenate([mean_O[inputs_O], std_O[inputs_O]]).astype(np.float32),
-                    centre_D[program.places],
-                    np.ascontiguousarray(noise_keys_P),
-                    np.ascontiguousarray(action_keys_L.T),
-                ),
-            )
-            launch, of_pairs, of_lanes, once = program.module.launch, c_int64(pairs), c_int64(lanes), c_int64(1)
-            threads = len(program.places) * pairs
-            launch("fill", threads, keys, program.on_gpu, room.noises, of_pairs, c_int64(threads))
-            launch("look", lanes, carries, constants, room.seen, of_lanes, once)
-            for step in range(self._spec.episode_steps):
-                if step % STEPS_BETWEEN_LOOKS == 0 and not carries.read(kernel.alive_word, 1).any():
-                    break
-                x = room.seen
-                for layer in program.layers:
-                    out, threads = room.hidden[layer.is_even], layer.tiles * pairs
-                    numbers = c_float(unit), of_pairs, c_int64(threads)
-                    launch(layer.name, threads, x, room.noises, centre, out, *numbers)
-                    x = out
-                launch("advance", lanes, carries, constants, x, action_keys, room.seen, of_lanes, once)
-            return kernel.results(carries.read(len(words) - kernel.episode_words)[None], lanes)
+            found = self._run(kernel, *given)
+            if not (checked := self.program(kernel.inputs_O).checked):
+                few = (centre_D, unit, mean_O, std_O, noise_keys_P[:CHECKED], *(x[: 2 * CHECKED] for x in given[-2:]))
+                self._check(kernel, found, few)
+                checked.append(True)
+            return found
+
+    def _check(self, kernel: EpisodeKernel, found: Episodes, few: tuple[Any, ...]) -> None:
+        centre_D, *given = few
+        wanted, what = kernel.run(kernel.network.pack(centre_D), *given), f"episodes of {self._spec.environment}"
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            require_same(one[: len(other)].astype(other.dtype), other, what, self._gpu.name)
+
+    def _run(
+        self,
+        kernel: EpisodeKernel,
+        centre_D: np.ndarray,
+        unit: float,
+        mean_O: np.ndarray,
+        std_O: np.ndarray,
+        noise_keys_P: Keys,
+        reset_keys_L: Keys,
+        action_keys_L: Keys,
+    ) -> Episodes:
+        """Episodes, as `run`."""
+        inputs_O, pairs = kernel.inputs_O, len(noise_keys_P)
+        program, lanes = self.program(inputs_O), 2 * len(noise_keys_P)
+        room = self._room(program, inputs_O, pairs)
+        resets = kernel.begin(reset_keys_L)
+        words = np.concatenate(list(resets), axis=1)[:, :lanes]
+        carries, constants, centre, keys, action_keys = map(
+            self._gpu.copied,
+            (
+                np.ascontiguousarray(words),
+                np.concatenate([mean_O[inputs_O], std_O[inputs_O]]).astype(np.float32),
+                centre_D[program.places],
+                np.ascontiguousarray(noise_keys_P),
+                np.ascontiguousarray(action_keys_L.T),
+            ),
+        )
+        launch, of_pairs, of_lanes, once = program.module.launch, c_int64(pairs), c_int64(lanes), c_int64(1)
+        threads = len(program.places) * pairs
+        launch("fill", threads, keys, program.on_gpu, room.noises, of_pairs, c_int64(threads))
+        launch("look", lanes, carries, constants, room.seen, of_lanes, once)
+        for step in range(self._spec.episode_steps):
+            if step % STEPS_BETWEEN_LOOKS == 0 and not carries.read(kernel.alive_word, 1).any():
+                break
+            x = room.seen
+            for layer in program.layers:
+                out, threads = room.hidden[layer.is_even], layer.tiles * pairs
+                numbers = c_float(unit), of_pairs, c_int64(threads)
+                launch(layer.name, threads, x, room.noises, centre, out, *numbers)
+                x = out
+            launch("advance", lanes, carries, constants, x, action_keys, room.seen, of_lanes, once)
+        return kernel.results(carries.read(len(words) - kernel.episode_words)[None], lanes)
 
     def _room(self, program: _Program, inputs_O: np.ndarray, pairs: int) -> _Room:
         """Memory for a number of pairs; that of another number is freed."""
@@ -118,6 +164,6 @@ class GpuEpisodes:
             self._rooms[key] = _Room(
                 self._gpu.array((len(program.places), pairs, TILE), np.uint8),
                 self._gpu.array((len(inputs_O), 2 * pairs), np.float32),
-                tuple(self._gpu.array((widest, 2 * pairs), np.float32) for _ in range(2)),
+                (self._gpu.array((widest, 2 * pairs), np.float32), self._gpu.array((widest, 2 * pairs), np.float32)),
             )
         return self._rooms[key]

@@ -45,7 +45,7 @@ def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]
 def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
     """Results of a scan: a loop if it is long and has no inputs or outputs per step, else straight code."""
     params = equation.params
-    constants, carries, length = params["num_consts"], params["num_carry"], params["length"]
+    (constants, carries), length = _counts(params), params["length"]
     shared, carry, rows = (
         arrays[:constants],
         list(arrays[constants : constants + carries]),
@@ -70,6 +70,14 @@ def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
         kept = kept[::-1] if params["reverse"] else kept
         found.append(np.stack(kept) if kept else np.zeros(variable.aval.shape, np.int64))
     return [*carry, *found]
+
+
+def _counts(params: dict[str, Any]) -> tuple[int, int]:
+    """Numbers of arrays of a scan that all trips share, and that they carry."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    shared, carry, _ = params["ft_in"].unpack()  # from JAX 0.11 on
+    return len(shared), len(carry)
 
 
 @primitive("while")
