@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=240.0, help="seconds after which no case is waited for")
     parser.add_argument("--together", type=int, default=os.cpu_count(), help="cases that compile side by side")
     parser.add_argument("--platform", default="cuda", help="cpu: to try the script without a GPU")
+    parser.add_argument("--only", help="cases whose JSON has a match of this regular expression")
     parser.add_argument(
         "--shrink", type=int, default=1, help="divide the numbers of members by this, to try the script"
     )

@@ -20,6 +20,7 @@ BELOW = {
     "backend": {"graph"},
     "frontend": {"graph"},
     "episodes": {"graph", "backend", "frontend"},
+    "gpu": {"graph", "backend", "frontend", "episodes"},
 }
 """Folder -> those it may import from, besides itself."""
 NEEDS = {"graph": {"numpy"}, "backend": {"numpy", "llvmlite"}, "frontend": {"numpy", "jax"}}

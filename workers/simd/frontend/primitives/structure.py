@@ -59,6 +59,11 @@ def _stack(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
     return np.stack(arrays, equation.params["axis"])
 
 
+@primitive("unstack")
+def _unstack(t: Tracer, equation: Any, x: Nodes) -> list[Nodes]:
+    return list(np.moveaxis(x, equation.params["axis"], 0))
+
+
 @primitive("tile")
 def _tile(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     return np.tile(x, equation.params["reps"])
