@@ -58,6 +58,11 @@ def test_sums_of_rows_are_those_of_numpy(name, shape):
     np.testing.assert_array_equal(jax.jit(jax.vmap(dense))(rows), np.stack([sums(one) for one in rows]))
 
 
+def test_constant_results_keep_their_dtypes():
+    found = without_scatters(lambda x: (segment_sums(x), False, 3))(np.ones(7, np.float32))
+    assert [one.dtype for one in found] == [np.float32, np.bool_, np.int32]
+
+
 @pytest.mark.parametrize("change", ["set", "max", "multiply", "add"])
 def test_other_scatters_stay_and_drop_what_they_should(change):
     def changed(x):
