@@ -38,7 +38,8 @@ def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
 
     def read(atom: Any) -> Any:
-        return jnp.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+        aval: Any = atom.aval
+        return jnp.asarray(atom.val, aval.dtype) if isinstance(atom, Literal) else values[atom]
 
     for equation in jaxpr.eqns:
         outputs = _outputs(equation, [read(atom) for atom in equation.invars])

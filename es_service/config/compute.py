@@ -20,7 +20,7 @@ class WorkerResources(Section):
     gpu: NotNegative = Field(
         0.0,
         description="GPUs of each worker. With a fraction below 1, workers share a GPU; with 0, episodes run on the "
-        "CPU. Its kind is a constant of the run: a GPU has bits of its own.",
+        "CPU. With rollout xla, a GPU has bits of its own.",
     )
 
 
@@ -64,8 +64,8 @@ class ComputeConfig(Section):
         description="Resources of one worker, which Ray reserves for its actor if the engine is ray.",
     )
     rollout: Text = Field(
-        description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
-        "faster. xla: by JAX, for GPUs and for tasks that simd cannot compile. host: by the Python code of a task "
+        description="How episodes are computed. simd: by code compiled for this kind of processor or GPU, about twenty "
+        "times faster. xla: by JAX, for tasks that simd cannot compile. host: by the Python code of a task "
         "that is not in JAX. auto: the fastest that can."
     )
     chunk_pairs: Count = Field(

@@ -35,6 +35,8 @@ class Rollout(Protocol):
     """Whether threads of one process compute side by side, without the interpreter's lock. If not, each core has a
     process."""
     runs_on_gpus: bool = False
+    gpus_only_train: bool = False
+    """Whether only training episodes run on a GPU, and all else on a core of its worker."""
     takes_chunks_together: bool = False
     """Whether an episode's bits do not depend on the others of its call, so that neighbouring chunks may share one."""
     copies_late_items: bool = True

@@ -158,9 +158,10 @@ def test_on_a_gpu_all_pairs_step_together_as_far_as_their_weights_fit():
 
 def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert load().compute.rollout == "simd"
-    assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "xla"
-    with pytest.raises(ConfigError, match=r"simd runs only on CPUs, but compute.worker_resources.gpu is 1;"):
-        load(MINIMAL, "compute.worker_resources.gpu=1", "compute.rollout=simd")
+    assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "simd"
+    elites = load(MINIMAL | {"search": {"algorithm": "map_elites"}}, "compute.worker_resources.gpu=1")
+    (warning,) = config_warnings(elites, POINT_MAZE, BACKENDS)
+    assert warning.startswith("compute.worker_resources.gpu: map_elites has no training episodes")
     no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive sort"})
     here = {"point_maze": no_simd}
     config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)

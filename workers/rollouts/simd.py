@@ -26,6 +26,7 @@ class Simd(RolloutBackend):
     name = "simd"
     runs_in_threads = True
     runs_on_gpus = True
+    gpus_only_train = True
     takes_chunks_together = True
     compile_s = (10, 4)
 
