@@ -331,8 +331,8 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
     if config.compute.worker_resources.gpu and rollouts[chosen].gpus_only_train and not has_pairs:
         method = config.search.algorithm
         warnings.append(
-            f"{RESOURCES}gpu: {method} has no training episodes, which are all that {chosen} computes on a GPU; the rest "
-            "is computed on the CPU"
+            f"{RESOURCES}gpu: {method} has no training episodes, which are all that {chosen} computes on a GPU; the "
+            "rest is computed on the CPU"
         )
     pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
