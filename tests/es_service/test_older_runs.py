@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -19,15 +20,16 @@ FOLDER = Path(__file__).parent / "golden" / "run_0_5"
 """Five generations of ME-ES on PointMaze, made by version 0.5.0."""
 
 
-def test_a_run_of_0_5_is_refused_and_left_alone():
-    before = (FOLDER / "run.db").read_bytes()
+def test_a_run_of_0_5_is_refused_and_left_alone(tmp_path):
+    folder = shutil.copytree(FOLDER, tmp_path / "run")
+    before = (folder / "run.db").read_bytes()
     for use in (api.open_run, api.resume, api.fork):
         with pytest.raises(StoreError, match=r"run\.db was written by an older version .*; use version 0\.5\.0 to"):
-            use(FOLDER)
-    printed = command("status", FOLDER)
+            use(folder)
+    printed = command("status", folder)
     assert printed.returncode == 1
     assert printed.stderr.count("\n") == 1
-    assert (FOLDER / "run.db").read_bytes() == before
+    assert (folder / "run.db").read_bytes() == before
 
 
 def test_a_run_without_the_columns_that_came_later_goes_on_and_its_page_says_what_is_missing(tmp_path, monkeypatch):
