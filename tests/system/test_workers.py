@@ -168,7 +168,7 @@ def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, mon
 
 def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, monkeypatch):
     broken = child_environment() | {"JAX_PLATFORMS": "no_such_platform"}
-    monkeypatch.setattr(inline_engine, "child_environment", lambda: broken)
+    monkeypatch.setattr(inline_engine, "child_environment", lambda gpus, place: broken)
     with pytest.raises(EvaluationError, match="no_such_platform"):
         run(tmp_path / "run", rollout="xla")  # simd needs none
     assert children() == []
