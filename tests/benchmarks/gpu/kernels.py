@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,22 +11,17 @@ import numpy as np
 from jax import lax
 
 from es_service.protocol.messages import WorkerSpec
-from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.policy_spec import PolicySpec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import episode_steps
-from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.backend.ptx import Call, Pointer, lane_function
-from workers.simd.backend.quick_division import EXACT, QuickWriter
 from workers.simd.backend.target import Target
-from workers.simd.backend.words import words_of
 from workers.simd.episodes.rollout import always_zero
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.gpu.program import KEY, function_of, words_in
 
 HIDDEN = 256
 """Units of each of the two hidden layers of the policies."""
-KEY = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
 
 
 class Physics(NamedTuple):
@@ -54,37 +49,6 @@ def physics_of(task: str) -> Physics:
 
     action = jax.ShapeDtypeStruct((SHIPPED[task].action_size,), jnp.float32)
     return Physics(begin, step, jax.eval_shape(begin, KEY), action)
-
-
-def words_in(tree: Any) -> int:
-    """Words of one lane of a pytree of arrays."""
-    return sum(map(words_of, jax.tree.leaves(tree)))
-
-
-def function_of(
-    name: str,
-    function: Callable[..., Any],
-    arguments: Sequence[tuple[str, Any]],
-    out: str,
-    target: Target,
-    shared: Sequence[str] = (),
-    quick: bool = False,
-) -> list[FunctionBuilder]:
-    """Function `void name(ptr ..., i64 lanes)` of a JAX function, and functions that it calls; it is the last one.
-
-    Args:
-        arguments: (pointer, shapes and dtypes) of each of its arguments. A pointer may occur twice.
-        out: pointer to the words of the result.
-        shared: pointers whose words all lanes share.
-        quick: whether quotients and roots are those of `quick_division.py`.
-    """
-    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(tree for _, tree in arguments)))
-    sources = [(pointer, words_in(tree)) for pointer, tree in arguments]
-    apart = {*(pointer for pointer, _ in arguments), out} - set(shared)
-    exact = graph_function(name + EXACT * quick, graph, outputs, sources, out, target, sorted(apart))
-    if not quick:
-        return [exact]
-    return [exact, graph_function(name, graph, outputs, sources, out, target, sorted(apart), QuickWriter)]
 
 
 def physics_functions(physics: Physics, target: Target, *, quick: bool = False) -> list[FunctionBuilder]:
@@ -150,7 +114,7 @@ def episode_functions(task: str, target: Target, *, quick: bool = False) -> list
         "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
     )
     given = [of_carry, of_constants, ("actions", outputs), ("action_keys", KEY)]
-    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick)
+    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick=quick)
     carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
     sees = Call(see[-1], ("carries", "constants", "seen"))
     moves = Call(move[-1], ("carries", "constants", "actions", "action_keys"))

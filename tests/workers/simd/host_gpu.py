@@ -28,8 +28,8 @@ def single_lanes() -> Iterator[Target]:
 def on_host(functions: Sequence[FunctionBuilder], name: str) -> Callable[..., None]:
     """A kernel of functions as a function of this processor, with the kernel's arguments."""
     called = [f for f in functions if not f.name.endswith("_of_lane") or f.name == f"{name}_of_lane"]
-    of_lane = called[-1] if called[-1].name == f"{name}_of_lane" else next(f for f in called if name in f.name)
-    called = [f for f in called if f is not of_lane]
+    of_lane = next(f for f in called if f.name == f"{name}_of_lane")
+    called.remove(of_lane)
     given = of_lane.parameters[:-1]
     inside = FunctionBuilder("inside", given, of_lane.target)
     names = ", ".join(one.replace(" noalias", "") for one in given)

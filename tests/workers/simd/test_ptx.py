@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
-from unittest import mock
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -23,10 +21,9 @@ from tests.benchmarks.gpu.kernels import (
     physics_functions,
     physics_of,
 )
-from workers.simd.backend.function_builder import FunctionBuilder, module
-from workers.simd.backend.native import load_compiled
+from tests.workers.simd.host_gpu import on_host, single_lanes
 from workers.simd.backend.ptx import Call, Pointer, lane_function, ptx
-from workers.simd.backend.target import ISAS, Isa, Target, host_target, target_of
+from workers.simd.backend.target import Target, target_of
 from workers.simd.backend.words import pack
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
@@ -40,24 +37,8 @@ NAN = np.uint32(0x7FC00000)
 @pytest.fixture
 def one() -> Iterator[Target]:
     """Target of this processor with vectors of one lane."""
-    widest = ISAS[host_target().isa]
-    with mock.patch.dict(ISAS, {"one": Isa("single numbers", widest.architecture, 1, *widest[3:])}):
-        yield host_target("one")
-
-
-def on_host(functions: Sequence[FunctionBuilder], name: str) -> Callable[..., None]:
-    """A kernel of functions as a function (arrays ..., lanes, steps) of this processor."""
-    called = [f for f in functions if not f.name.endswith("_of_lane") or f.name == f"{name}_of_lane"]
-    of_lane = called[-1]
-    *arrays, _, _, _ = of_lane.parameters
-    inside = FunctionBuilder("inside", of_lane.parameters[:-1], of_lane.target)
-    names = [one.replace(" noalias", "") for one in of_lane.parameters[:-1]]
-    inside.loop(
-        "%lanes", lambda lane, _: (inside.do(f"call void @{of_lane.name}({', '.join(names)}, i64 {lane})"), [])[1]
-    )
-    text = module([*called, inside])
-    native = load_compiled(text, lambda: text, of_lane.target)
-    return native.function(*[ctypes.c_void_p] * len(arrays), ctypes.c_int64, ctypes.c_int64)
+    with single_lanes() as target:
+        yield target
 
 
 def without_nans(words: np.ndarray) -> np.ndarray:
