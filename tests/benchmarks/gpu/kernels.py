@@ -18,7 +18,7 @@ from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.backend.ptx import Call, Pointer, lane_function
 from workers.simd.backend.target import Target
 from workers.simd.episodes.rollout import always_zero
-from workers.simd.gpu.program import KEY, function_of, words_in
+from workers.simd.gpu.program import KEY, function_of, step_functions, words_in
 
 HIDDEN = 256
 """Units of each of the two hidden layers of the policies."""
@@ -104,28 +104,14 @@ def episode_functions(task: str, target: Target, *, quick: bool = False) -> list
 
     constants are the means and standard deviations of the inputs. `advance` moves and looks again.
     """
-    spec, inputs_O = worker_spec(task), inputs_of(task)
-    steps = episode_steps(make_environment(task, {}), spec, training=True, inputs_O=inputs_O)
-    carry = jax.eval_shape(steps.begin, KEY)
-    inputs, outputs = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (len(inputs_O), spec.policy.outputs))
-    of_carry, of_constants = ("carries", carry), ("constants", inputs)
+    environment, spec, inputs_O = make_environment(task, {}), worker_spec(task), inputs_of(task)
+    steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
     reset = function_of("reset", steps.begin, [("keys", KEY)], "carries", target)
-    see = function_of(
-        "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
-    )
-    given = [of_carry, of_constants, ("actions", outputs), ("action_keys", KEY)]
-    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick=quick)
-    carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
-    sees = Call(see[-1], ("carries", "constants", "seen"))
-    moves = Call(move[-1], ("carries", "constants", "actions", "action_keys"))
-    of_move = [carries, constants, Pointer("actions"), Pointer("action_keys"), seen]
+    calls = [Call(reset[-1], ("keys", "carries"))]
     return [
         *reset,
-        *see,
-        *move,
-        lane_function("begin", [Pointer("keys"), carries], [Call(reset[-1], ("keys", "carries"))], target),
-        lane_function("look", [carries, constants, seen], [sees], target),
-        lane_function("advance", of_move, [moves, sees], target),
+        lane_function("begin", [Pointer("keys"), Pointer("carries")], calls, target),
+        *step_functions(environment, spec, inputs_O, target, quick=quick),
     ]
 
 

@@ -98,12 +98,6 @@ def _byte_product(x_P_S_I: Any, j_P_I_J: Any) -> Any:
     return 2.0 * jnp.stack(sums, axis=1) + jnp.sum(x_P_S_I, axis=-1, keepdims=True)
 
 
-def _byte_row_product(x_P_S_I: Any, j_P_J_I: Any) -> Any:
-    j = j_P_J_I.astype(jnp.float32)
-    sums = [jnp.sum(x_P_S_I[:, s, None, :] * j, axis=2) for s in range(2)]
-    return 2.0 * jnp.stack(sums, axis=1) + jnp.sum(x_P_S_I, axis=-1, keepdims=True)
-
-
 def _rank_one(k_P_I_J: Any) -> Any:
     return k_P_I_J[:, :, 0].astype(jnp.float32), k_P_I_J[:, 0, :].astype(jnp.float32)
 
@@ -118,7 +112,6 @@ WAYS = {
     "pairs_float32": Way(_pairs(lambda k: k.astype(jnp.float32)), _with_pairs(_float_product)),
     "pairs_bfloat16": Way(_pairs(lambda k: k.astype(jnp.bfloat16)), _with_pairs(_bfloat_product)),
     "pairs_bytes": Way(_pairs(_byte), _with_pairs(_byte_product)),
-    "pairs_byte_rows": Way(_pairs(lambda k: _byte(jnp.swapaxes(k, 1, 2))), _with_pairs(_byte_row_product)),
     "rank_one": Way(_pairs(_rank_one), _with_pairs(_rank_one_product)),
 }
 """`members` has the rounded weights of each member, as the CPU's rollouts. Those of pairs compute the centre's product

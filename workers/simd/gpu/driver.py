@@ -125,8 +125,7 @@ class GpuArray:
 
     def __del__(self) -> None:
         """Free the memory; at the end of the process the driver does it."""
-        if self.pointer.value and self._gpu._library is not None:
-            self._gpu._library.cuMemFree_v2(self.pointer)
+        self._gpu._library.cuMemFree_v2(self.pointer)
 
 
 class Module:

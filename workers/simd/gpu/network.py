@@ -46,11 +46,6 @@ class GpuLayer(NamedTuple):
     activation: Activation | None
     is_last: bool
 
-    @property
-    def is_even(self) -> bool:
-        """Whether its number is even, for memory that layers use in turns."""
-        return self.name[-1] in "02468"
-
 
 def layers_of(policy: PolicySpec, inputs_O: NDArray[np.intp]) -> tuple[tuple[GpuLayer, ...], NDArray[np.uint32]]:
     """Layers of a policy, and the places [row, TILE] of their weights in the flat vector of parameters.

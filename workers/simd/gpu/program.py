@@ -74,14 +74,24 @@ def noise_functions(target: Target) -> list[FunctionBuilder]:
 
 
 def episode_functions(
-    environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, target: Target, *, quick: bool = True
+    environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, target: Target
 ) -> list[FunctionBuilder]:
     """Functions of the kernels of a run's training episodes.
 
     Args:
         inputs_O: indices of the observations that are computed; others are always zero.
-        quick: as for `function_of`, in `advance`.
     """
+    return [
+        *noise_functions(target),
+        *(layer_function(layer, target) for layer in layers_of(spec.policy, inputs_O)[0]),
+        *step_functions(environment, spec, inputs_O, target, quick=True),
+    ]
+
+
+def step_functions(
+    environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, target: Target, *, quick: bool
+) -> list[FunctionBuilder]:
+    """Functions of the kernels `look` and `advance`, with arguments as `episode_functions` and `function_of`."""
     steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
     carry = jax.eval_shape(steps.begin, KEY)
     inputs, outputs = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (len(inputs_O), spec.policy.outputs))
@@ -98,8 +108,6 @@ def episode_functions(
     return [
         *see,
         *move,
-        *noise_functions(target),
-        *(layer_function(layer, target) for layer in layers_of(spec.policy, inputs_O)[0]),
         lane_function("look", [carries, constants, seen], [sees], target),
         lane_function("advance", of_move, [moves, sees], target),
     ]

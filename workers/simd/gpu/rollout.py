@@ -23,8 +23,6 @@ from workers.simd.gpu.program import episode_functions
 
 STEPS_BETWEEN_LOOKS = 25
 """Control steps after which the processor looks whether any episode goes on; it costs some tens of microseconds."""
-
-
 CHECKED = 8
 """Pairs whose episodes are compared with those of the processor, when code is new to this process."""
 
@@ -46,8 +44,6 @@ class _Program(NamedTuple):
     places: np.ndarray
     on_gpu: GpuArray
     """The places."""
-    checked: list[bool]
-    """Not empty once results have been compared with those of the processor."""
 
 
 def episodes_on_gpu(environment: Environment, spec: WorkerSpec, gpu: Gpu | None = None) -> Compilable:
@@ -70,47 +66,40 @@ class GpuEpisodes:
         self._environment, self._spec, self._gpu = environment, spec, gpu
         self._programs: dict[bytes, _Program] = {}
         self._rooms: dict[tuple[bytes, int], _Room] = {}
-        self._lock = threading.Lock()
+        self._checked: set[bytes] = set()
+        """Programs whose results have been compared with those of the processor."""
+        self._lock = threading.RLock()
 
     def program(self, inputs_O: np.ndarray) -> _Program:
         """The kernels for a choice of inputs, compiled at the first call. Raises GpuError as `Gpu.module`."""
-        self._gpu.enter()
         key = inputs_O.tobytes()
-        if key not in self._programs:
-            layers, places = layers_of(self._spec.policy, inputs_O)
-            functions = episode_functions(self._environment, self._spec, inputs_O, self._gpu.target)
-            self._programs[key] = _Program(self._gpu.module(functions), layers, places, self._gpu.copied(places), [])
-        return self._programs[key]
+        with self._lock:
+            self._gpu.enter()
+            if key not in self._programs:
+                layers, places = layers_of(self._spec.policy, inputs_O)
+                functions = episode_functions(self._environment, self._spec, inputs_O, self._gpu.target)
+                self._programs[key] = _Program(self._gpu.module(functions), layers, places, self._gpu.copied(places))
+            return self._programs[key]
 
-    def run(
-        self,
-        kernel: EpisodeKernel,
-        centre_D: np.ndarray,
-        unit: float,
-        mean_O: np.ndarray,
-        std_O: np.ndarray,
-        noise_keys_P: Keys,
-        reset_keys_L: Keys,
-        action_keys_L: Keys,
-    ) -> Episodes:
-        """Episodes [L] of both members of each pair, as `EpisodeKernel.run` of the kernel with the same arguments.
+    def run(self, kernel: EpisodeKernel, centre_D: np.ndarray, unit: float, *given: Any) -> Episodes:
+        """Episodes [L] of both members of each pair, with the bits of a kernel.
+
+        Args:
+            given: mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L, as for `EpisodeKernel.run`.
 
         Raises WrongCodeError if new code does not compute the first episodes as the processor does.
         """
-        given = (centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
         with self._lock:
-            found = self._run(kernel, *given)
-            if not (checked := self.program(kernel.inputs_O).checked):
-                few = (centre_D, unit, mean_O, std_O, noise_keys_P[:CHECKED], *(x[: 2 * CHECKED] for x in given[-2:]))
-                self._check(kernel, found, few)
-                checked.append(True)
+            found = self._run(kernel, centre_D, unit, *given)
+            if (key := kernel.inputs_O.tobytes()) not in self._checked:
+                mean_O, std_O, *keys = given
+                few = [one[: CHECKED * of_each] for one, of_each in zip(keys, (1, 2, 2), strict=True)]
+                wanted = kernel.run(kernel.network.pack(centre_D), unit, mean_O, std_O, *few)
+                for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+                    what = f"episodes of {self._spec.environment}"
+                    require_same(one[: len(other)], other, what, self._gpu.name)
+                self._checked.add(key)
             return found
-
-    def _check(self, kernel: EpisodeKernel, found: Episodes, few: tuple[Any, ...]) -> None:
-        centre_D, *given = few
-        wanted, what = kernel.run(kernel.network.pack(centre_D), *given), f"episodes of {self._spec.environment}"
-        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-            require_same(one[: len(other)].astype(other.dtype), other, what, self._gpu.name)
 
     def _run(
         self,
@@ -123,7 +112,6 @@ class GpuEpisodes:
         reset_keys_L: Keys,
         action_keys_L: Keys,
     ) -> Episodes:
-        """Episodes, as `run`."""
         inputs_O, pairs = kernel.inputs_O, len(noise_keys_P)
         program, lanes = self.program(inputs_O), 2 * len(noise_keys_P)
         room = self._room(program, inputs_O, pairs)
@@ -147,8 +135,8 @@ class GpuEpisodes:
             if step % STEPS_BETWEEN_LOOKS == 0 and not carries.read(kernel.alive_word, 1).any():
                 break
             x = room.seen
-            for layer in program.layers:
-                out, threads = room.hidden[layer.is_even], layer.tiles * pairs
+            for number, layer in enumerate(program.layers):
+                out, threads = room.hidden[number % 2], layer.tiles * pairs
                 numbers = c_float(unit), of_pairs, c_int64(threads)
                 launch(layer.name, threads, x, room.noises, centre, out, *numbers)
                 x = out
