@@ -35,7 +35,7 @@ long: .venv/installed-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'long and not alone' tests/system
 	$(BIN)/python -m pytest -m 'long and alone' tests/system
 
-# While writing code: no lint, no tests of more than five seconds, none of the whole system.
+# While writing code: no lint, no tests of more than a second, none of the whole system.
 quick: .venv/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not long and not image' tests/es_service tests/laws tests/workers
 

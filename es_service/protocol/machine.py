@@ -9,6 +9,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Collection, Iterable, Mapping
+from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -26,8 +27,13 @@ CODE = "code"
 
 def platform_info() -> dict[str, str]:
     """Package versions and CPU kind of this machine, by name. Equal platforms give the same results bit for bit."""
-    versions = {name: metadata.version(name) for name in PACKAGES}
-    return {"python": platform.python_version(), "es-service": VERSION, **versions, "cpu": cpu_kind()}
+    return {"python": platform.python_version(), "es-service": VERSION, **_versions(), "cpu": cpu_kind()}
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Versions of other packages, read once: a process goes on with what it has imported."""
+    return {name: metadata.version(name) for name in PACKAGES}
 
 
 def platform_text(info: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -197,11 +197,11 @@ def modules_of(path: str) -> Modules:
             file, is_package = Path(spec.origin), spec.submodule_search_locations is not None
             source = "/".join(file.parts[-1 - spec.name.count(".") - is_package :])
             content, package = file.read_bytes(), spec.name if is_package else spec.name.rpartition(".")[0]
-            needs = _imports(content, package) if file.suffix == ".py" else []
+            needs = _imports(content, package) if file.suffix == ".py" else ()
             wanted += needs
-            above = spec.name.split(".")[:-1]
-            needs += [".".join(above[:count]) for count in range(1, len(above) + 1)]
-            found[spec.name] = UserModule(file, source, sha256(content), frozenset(needs))
+            parts = spec.name.split(".")
+            above = (".".join(parts[:count]) for count in range(1, len(parts)))
+            found[spec.name] = UserModule(file, source, sha256(content), frozenset((*needs, *above)))
     return Modules(found, frozenset(others - sys.stdlib_module_names), is_shared)
 
 
@@ -242,12 +242,13 @@ def _place(spec: importlib.machinery.ModuleSpec) -> str:
     return str(Path(os.path.abspath(own)).parents[spec.name.count(".")])
 
 
-def _imports(content: bytes, package: str) -> list[str]:
+@lru_cache(maxsize=1024)
+def _imports(content: bytes, package: str) -> tuple[str, ...]:
     """Names of the modules that a source file may import, also inside its functions."""
     try:
         tree = ast.parse(content)
     except (SyntaxError, ValueError):
-        return []  # its import is going to fail
+        return ()  # its import is going to fail
     found: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -256,7 +257,7 @@ def _imports(content: bytes, package: str) -> list[str]:
             above = package.rsplit(".", node.level - 1)[0] if node.level > 1 else package
             base = ".".join(filter(None, (above if node.level else "", node.module)))
             found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-    return [name for name in found if name]
+    return tuple(filter(None, found))
 
 
 def sha256(content: bytes) -> str:

@@ -11,6 +11,8 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.database import database
+
 PAGE = 8192
 """Bytes of a page of the database."""
 VALUES = (None, 0, -1, 7, 2**62, 0.5, -1e300, float("inf"), "", "text", "é\0", b"", b"\xff" * 9)
@@ -109,7 +111,7 @@ def damage_rows(file: Path, rng: random.Random) -> str:
     """Change rows of a database behind the back of the store, without new SHA-256s; returns the kind of damage."""
     table = rng.choice(("history", "state", "state", "platform", "meta"))
     kind = rng.choice(("deleted", "deleted too", "duplicated", "edited", "edited too"))
-    with contextlib.closing(sqlite3.connect(file)) as connection, connection:
+    with database(file) as connection:
         rows = connection.execute(f"SELECT * FROM {table}").fetchall()
         names = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
         chosen = rng.sample(rows, rng.randint(1, len(rows)) if kind == "deleted too" else 1)

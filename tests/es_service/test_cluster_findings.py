@@ -122,6 +122,7 @@ def test_a_dashboard_is_open_if_it_answers_without_a_token(status, is_open):
     assert answers_anyone(address) is False, "nothing listens there any more"
 
 
+@pytest.mark.slow
 def test_the_probe_runs_where_es_service_is_another_one(tmp_path):
     """Ray sends the function itself, so that no module of ours has to be there."""
     cloudpickle = importlib.import_module("ray.cloudpickle")

@@ -224,6 +224,7 @@ def test_members_follow_from_the_algorithm():
 POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.fixed_dictionaries(

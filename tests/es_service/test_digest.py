@@ -1,8 +1,5 @@
 """What the digest of a run sees and what it does not."""
 
-import contextlib
-import sqlite3
-
 import numpy as np
 import pytest
 
@@ -15,6 +12,7 @@ from es_service.store.digest import arrays_sha256, checked_parts, digest_at, dig
 from es_service.store.reader import read_generation
 from es_service.store.tables import as_table, table_bytes
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.es_service.store_examples import (
     COLUMNS,
     EVALUATION_COLUMNS,
@@ -43,7 +41,7 @@ def folder(tmp_path):
 
 def change(folder, statement, *values):
     """Change the database behind the store's back."""
-    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
+    with database(folder / "run.db") as connection:
         assert connection.execute(statement, values).rowcount == 1
 
 
@@ -88,7 +86,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
             }
             store.commit(generation, parts, history_row(generation), evaluated_table(generation))
     assert digest(tmp_path / "other") == expected
-    with contextlib.closing(sqlite3.connect(tmp_path / "other" / "run.db")) as connection:
+    with database(tmp_path / "other" / "run.db") as connection:
         connection.execute("VACUUM")
     assert digest(tmp_path / "other") == expected
 

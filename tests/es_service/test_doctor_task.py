@@ -30,6 +30,7 @@ def test_a_task_that_repeats_is_said_to(name, unit, monkeypatch):
     assert re.match(rf"[\d,]+ {unit}/s on one core", speed)
 
 
+@pytest.mark.slow
 def test_a_task_that_does_not_repeat_is_told_from_one_that_does(monkeypatch, capsys):
     monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
     *_, (level, repeats), _ = findings(f"python:{MODULE}:Forgetful")

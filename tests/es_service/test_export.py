@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 import subprocess
 
 import numpy as np
@@ -15,6 +13,7 @@ from es_service.runs import session
 from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
 from tests.benchmarks.science import in_this_process
+from tests.database import database
 
 FIRST, LAST = 2, 8
 CONFIG = {
@@ -44,6 +43,7 @@ def after_a_generation(run, read):
     return read_later
 
 
+@pytest.mark.slow
 def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_look(run, tmp_path, monkeypatch):
     same = api.run(api.load_config(CONFIG), tmp_path / "same").run
     expected = {}
@@ -68,7 +68,7 @@ def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_
 
 
 def test_a_run_that_lost_its_newest_history_row_is_not_exported_as_of_the_generation_before(run, tmp_path):
-    with contextlib.closing(sqlite3.connect(run.folder / "run.db")) as connection, connection:
+    with database(run.folder / "run.db") as connection:
         connection.execute("DELETE FROM history WHERE generation = ?", (run.generation,))
     for use in (lambda: export(run, "csv", tmp_path), lambda: list(tables(run)), lambda: arrays(run)):
         with pytest.raises(StoreError, match=f"the history after generation {FIRST - 1} is missing"):

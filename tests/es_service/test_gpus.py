@@ -53,6 +53,7 @@ its_gpu.parameters = 2
 its_gpu.deterministic = True
 
 
+@pytest.mark.slow
 def test_a_new_worker_takes_the_place_of_one_that_was_lost(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,8")
     search = {"algorithm": "es", "pairs": 8}

@@ -98,6 +98,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
     assert footprint() == before
 
 
+@pytest.mark.slow
 def test_threads_that_are_lost_together_before_they_are_up_do_not_end_the_run():
     with inline_engine(SPEC, Limits(workers=6, restart_backoff_s=0.01), threads=True) as engine:
         (victim,) = set(engine.transport.process_ids().values())
@@ -141,6 +142,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     assert footprint() == before
 
 
+@pytest.mark.slow
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
     with inline_engine(SPEC, Limits(workers=1, item_s=60.0, restart_backoff_s=0.0)) as engine:
@@ -149,6 +151,7 @@ def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
             engine.evaluate(around(FIRST, broken))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_two_hundred_centres_at_once_on_any_number_of_children(workers):
     """More than a child keeps; one by one, then in work items of several centres, then the oldest again."""

@@ -275,6 +275,7 @@ def test_a_default_timeout_of_sockets_is_not_the_workers():
         socket.setdefaulttimeout(None)
 
 
+@pytest.mark.slow
 def test_an_environment_that_exits_is_a_failure_with_its_traceback():
     exits = spec(environment="tests.examples.exits:Exits")
     with (

@@ -60,6 +60,7 @@ def runs(tmp_path_factory):
     return {count: long_run(tmp_path_factory.mktemp("runs"), count) for count in (FEW, SMALL, LARGE)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", ["history", "evaluations", "export", "report"])
 def test_a_generation_takes_about_eight_bytes_a_value(runs, read):
     def peak(generations: int) -> int:

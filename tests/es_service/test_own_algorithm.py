@@ -200,6 +200,7 @@ def _rows(map_, rows):
 FAR = ["map.cells=[200, 200]", "search.step.learning_rate=1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["forgetful", "growing", "shrinking", "emptying"])
 def test_a_search_may_lose_what_it_had(tmp_path, name):
     settings = [f"search.algorithm={__name__}:{name}", *FAR, f"search.centres={3 if name == 'shrinking' else 1}"]

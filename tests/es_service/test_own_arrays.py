@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from es_service import api
 from es_service.errors import StoreError
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
+from tests.database import database
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -122,7 +122,7 @@ def test_they_cannot_be_changed_in_place_also_after_a_resume(tmp_path):
 def test_a_part_that_nothing_changes_is_written_once(tmp_path):
     folder = begin(tmp_path / "run", "idle").folder
     api.resume(folder, ["budget.generations=8"])
-    with sqlite3.connect(folder / "run.db") as connection:
+    with database(folder / "run.db") as connection:
         written = connection.execute("SELECT generation FROM state WHERE part = 'own'").fetchall()
     assert written == [(0,)]
 

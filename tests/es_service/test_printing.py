@@ -49,6 +49,7 @@ def test_only_one_module_makes_consoles():
     assert [file.name for file in files if re.search(others, file.read_text())] == ["console.py"]
 
 
+@pytest.mark.slow
 def test_names_and_values_of_a_user_are_printed_as_they_are(console, tmp_path, monkeypatch):
     folder = tmp_path / STRANGE.replace("/", "|")
     outcome = api.run(SMALL | {"budget": {"generations": 1}}, folder)
@@ -88,6 +89,7 @@ def test_commands_can_be_pasted_from_a_narrow_terminal(tmp_path):
     assert shlex.split(result.stderr.splitlines()[-1].partition(": ")[2])[1:] == ["run", "CONFIG", "--out", str(folder)]
 
 
+@pytest.mark.slow
 def test_the_error_of_a_config_shows_a_value_as_it_is(tmp_path):
     with pytest.raises(ConfigError, match=re.escape(STRANGE)):
         api.load_config(SMALL, [f"task.options.start='{STRANGE}'"])

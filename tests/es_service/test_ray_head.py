@@ -43,6 +43,7 @@ def test_a_head_that_needs_a_token_answers_nobody_without_one(head):
     assert status_code(grpc_module(), head, HEAD_CALL, "right") is None
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_the_token_is_said_before_a_cluster_is_joined(head, monkeypatch, tmp_path):
     with pytest.raises(
         EvaluationError, match=r"asks for a token, and this process sends none\. Set RAY_AUTH_MODE=token"

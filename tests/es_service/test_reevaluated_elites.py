@@ -112,6 +112,7 @@ def test_a_killed_run_ends_with_the_same_bits(run, tmp_path):
     assert api.open_run(folder).digest() == run.digest()
 
 
+@pytest.mark.slow
 def test_it_is_verified_reported_and_exported(run, tmp_path):
     assert all(not one.differences for one in verification.verify(run, 5))
     places = list(run.map[["cell_x", "cell_y"]].itertuples(index=False, name=None))[:4]

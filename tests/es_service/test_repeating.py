@@ -40,6 +40,7 @@ def verified(run, capsys):
     return ended.value.exit_code, json.loads(said.out)
 
 
+@pytest.mark.slow
 def test_a_run_records_that_its_task_does_not_repeat_itself_and_verify_says_so(tmp_path, capsys):
     notices: list[str] = []
     run = done(FORGETFUL, tmp_path / "run", notices)
@@ -59,6 +60,7 @@ def test_a_run_records_that_its_task_does_not_repeat_itself_and_verify_says_so(t
     assert "So the differences do not say that the run is wrong" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_a_function_does_is_found_by_verify_and_a_task_that_repeats_is_equal(tmp_path, capsys):
     notices: list[str] = []
     code, said = verified(done(RESTLESS, tmp_path / "restless", notices), capsys)

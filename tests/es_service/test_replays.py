@@ -78,6 +78,7 @@ def test_a_replay_that_is_not_the_stored_episode_is_an_error_in_the_page(tmp_pat
     assert "so this is an error; please report it" in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fitness", ["sum", "final"])
 def test_the_certified_policy_is_shown_in_its_certification_episode_of_median_fitness(tmp_path, fitness):
     config = {**CONFIG, "task": CONFIG["task"] | {"fitness": fitness}}

@@ -2,7 +2,6 @@
 
 import html
 import re
-import sqlite3
 import sys
 from dataclasses import replace
 
@@ -19,6 +18,7 @@ from es_service.report.facts import number
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
+from tests.database import database
 from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
 
@@ -173,7 +173,7 @@ def test_a_common_target_is_the_threshold(tmp_path):
 
 
 def test_a_run_without_generations_is_refused(runs, tmp_path):
-    with sqlite3.connect(write_run(tmp_path / "run") / "run.db") as connection:
+    with database(write_run(tmp_path / "run") / "run.db") as connection:
         connection.execute("DELETE FROM history")
     with pytest.raises(NotInRunError, match="has no finished generation yet"):
         comparison_page([runs[0], read_run(tmp_path / "run")])
@@ -219,7 +219,7 @@ def test_all_text_of_a_user_is_escaped(tmp_path):
     pages = []
     for name, value in ((EVIL, f"v{EVIL}"), ("", "b")):
         folders = named_runs(tmp_path / str(len(name)), name, value)
-        with sqlite3.connect(folders[0] / "run.db") as connection:
+        with database(folders[0] / "run.db") as connection:
             connection.execute("DELETE FROM history WHERE generation = 7")
         pages.append(comparison_page([read_run(folder) for folder in folders], ["task.options.way"]))
     page, plain = pages
@@ -231,6 +231,7 @@ def test_all_text_of_a_user_is_escaped(tmp_path):
     assert page.count("v&lt;/script&gt;") > 3  # the name of the group, in figures and tables
 
 
+@pytest.mark.slow
 def test_names_are_no_formulas_in_figures(tmp_path):
     """matplotlib reads what is between two $ as a formula, and refuses one that is wrong."""
     runs = [read_run(folder) for folder in named_runs(tmp_path, r"$\frac$", r"v$\frac$")]
@@ -297,6 +298,7 @@ def test_plots_of_centres_and_curves(folders, runs, axes):
         plots.curves(folders[0], axes, "no_column")
 
 
+@pytest.mark.slow
 def test_maps_of_other_dimensions_are_plotted_or_refused(tmp_path, axes):
     assert plots.behaviour_map(write_run(tmp_path / "one", task=task_with(1)), axes) is not None
     cvt = write_run(tmp_path / "cvt", {"map.kind": "cvt", "map.cells": [30]}, task=task_with(2))

@@ -1,6 +1,5 @@
 """What a report says about a run, compared with a run whose every value is known, with damaged ones, and with none."""
 
-import sqlite3
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from es_service.report.data import read_run
 from es_service.runs.view import open_run
 from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.run_examples import write_run
 from workers.environments import SHIPPED
 
@@ -186,7 +186,7 @@ def test_a_run_without_a_map_has_none(tmp_path):
 
 
 def damaged(folder, statement, *values):
-    with sqlite3.connect(folder / "run.db") as connection:
+    with database(folder / "run.db") as connection:
         assert connection.execute(statement, values).rowcount == 1
     return read_run(folder)
 

@@ -18,6 +18,7 @@ def counted(values):
     return medians[outside], medians[-1 - outside]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
 def test_an_interval_is_that_of_all_resamples(n):
     rng = np.random.default_rng(n)

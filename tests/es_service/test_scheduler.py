@@ -285,6 +285,7 @@ def test_an_event_costs_little():
     assert seconds_per_event(2, 640) < 500e-6
 
 
+@pytest.mark.slow
 def test_an_event_costs_hardly_more_with_many_workers_or_items():
     """About a tenth more for 10,000. Were all workers or items looked at, more than three times."""
     few_s = min(seconds_per_event(100, 640) for _ in range(3))

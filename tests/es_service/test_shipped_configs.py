@@ -22,7 +22,9 @@ COMMENTED = [path for path in ALL if path.parent.name != "paper"]
 
 
 def each(paths: list[Path]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("path", paths, ids=lambda path: str(path.relative_to(CONFIGS)))
+    """A test of each; Brax takes seconds to say what its ant is."""
+    marked = [pytest.param(path, marks=pytest.mark.slow if path.name.startswith("brax_") else ()) for path in paths]
+    return pytest.mark.parametrize("path", marked, ids=[str(path.relative_to(CONFIGS)) for path in paths])
 
 
 @each(ALL)

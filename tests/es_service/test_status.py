@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import socket
-import sqlite3
 from types import SimpleNamespace
 
 import pytest
@@ -28,6 +27,7 @@ from es_service.runs import recent
 from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
+from tests.database import database
 from tests.run_examples import write_run
 from tests.system.session import SMALL
 
@@ -105,7 +105,7 @@ def test_a_damaged_row_hides_only_what_is_read_from_it(console, tmp_path, capsys
     run = api.open_run(write_run(tmp_path / "run", generations=10))
     print_status(console, run)
     whole = capsys.readouterr().out.splitlines()
-    with contextlib.closing(sqlite3.connect(run.folder / "run.db")) as connection, connection:
+    with database(run.folder / "run.db") as connection:
         connection.execute("UPDATE history SET sha256 = x'00' WHERE generation = 4")
     problem = f"{run.folder} cannot be read: the history row of generation 4 is damaged or missing"
     gone = f"not known          objectives and faults of the recent generations: {problem}"
@@ -127,7 +127,7 @@ def test_a_damaged_row_hides_only_what_is_read_from_it(console, tmp_path, capsys
         ({"generations": 3}, "generations is spent", {"budget.generations=6"}),
         ({"env_steps": 6000, "generations": 90}, "steps is spent", {"budget.env_steps=12000"}),
         ({"env_steps": 10}, "steps is spent", {"budget.env_steps=1200"}),
-        ({"wall_clock_s": 1e-6}, "s is spent", None),
+        pytest.param({"wall_clock_s": 1e-6}, "s is spent", None, marks=pytest.mark.slow),
         ({"target_fitness": -1e9, "generations": 4}, "is reached", {"budget.target_fitness=null"}),
         ({"target_fitness": -1e9}, "is reached", {"budget.target_fitness=null", "budget.generations=2"}),
     ],

@@ -1,9 +1,7 @@
 """Creating a run and committing to it."""
 
-import contextlib
 import math
 import os
-import sqlite3
 import tempfile
 from pathlib import Path
 
@@ -24,6 +22,7 @@ from es_service.store.reader import (
     read_platforms,
 )
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.es_service.store_examples import (
     COLUMNS,
     CONFIG_YAML,
@@ -43,7 +42,7 @@ from tests.es_service.store_examples import (
 
 
 def rows(folder, query):
-    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection:
+    with database(folder / "run.db") as connection:
         return connection.execute(query).fetchall()
 
 

@@ -1,11 +1,9 @@
 """Damaged files: the run continues with the same bits, or says that it cannot."""
 
-import contextlib
 import errno
 import os
 import random
 import shutil
-import sqlite3
 
 import numpy as np
 import pytest
@@ -26,6 +24,7 @@ from es_service.store.reader import (
 )
 from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,
@@ -149,9 +148,8 @@ def test_a_copy_of_damaged_content_does_not_replace_a_good_one(tmp_path, monkeyp
 
 def test_a_state_row_that_vanished_is_not_replaced_by_an_older_one(tmp_path):
     folder = finished(tmp_path / "run", 6)
-    with sqlite3.connect(folder / "run.db") as connection:
+    with database(folder / "run.db") as connection:
         connection.execute("DELETE FROM state WHERE part = 'observations' AND generation = 5")
-    connection.close()
     with pytest.raises(StoreError, match="state of generation 5 is damaged"):
         read_parts(folder)
     with RunStore.open(folder) as run:
@@ -160,7 +158,7 @@ def test_a_state_row_that_vanished_is_not_replaced_by_an_older_one(tmp_path):
 
 
 def behind_the_stores_back(folder, *statements):
-    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
+    with database(folder / "run.db") as connection:
         for statement in statements:
             connection.execute(statement)
 
@@ -254,7 +252,7 @@ def test_a_database_that_cannot_be_kept_loses_no_generation(tmp_path, monkeypatc
 
 def _content(file):
     """All rows of a database, as statements."""
-    with contextlib.closing(sqlite3.connect(file)) as connection:
+    with database(file) as connection:
         return list(connection.iterdump())
 
 

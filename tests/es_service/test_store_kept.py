@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 from es_service.errors import StoreError
 from es_service.store.reader import read_kept, read_parts
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.es_service.store_examples import advance, assert_same_state, assert_sound, create, digest, finished, state_at
 
 
@@ -74,9 +73,8 @@ def test_a_damaged_kept_state_is_told_and_the_run_goes_on(tmp_path):
     with create(tmp_path / "run") as store:
         store.keep_every = 4
         advance(store, 10)
-    with sqlite3.connect(tmp_path / "run/run.db") as connection:
+    with database(tmp_path / "run/run.db") as connection:
         connection.execute("UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation = 4")
-    connection.close()
     with RunStore.open(tmp_path / "run") as store:
         (notice,) = store.notices
         assert "state of 'observations' at generation 4 does not match its SHA-256" in notice

@@ -299,6 +299,7 @@ def test_the_simulations_sent_copies(copies_sent):
     assert sum(copies_sent) > 200
 
 
+@pytest.mark.slow
 def test_copies_cost_hardly_more_with_many_slow_workers():
     """Half of the workers never answer; the others take their items one by one."""
 

@@ -66,6 +66,7 @@ def test_a_process_starts_when_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     assert system.process_start_s() == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [True, False], ids=["parent killed", "parent ended"])
 def test_a_child_ends_with_its_parent_where_the_kernel_does_not_see_to_it(killed: bool) -> None:
     parent = without_linux("-c", PARENT, stdout=subprocess.PIPE)

@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import socket
-import sqlite3
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -25,6 +24,7 @@ from es_service.watch import channels
 from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
 from es_service.watch.server import Site
+from tests.database import database
 from tests.es_service.test_report_page import Elements
 from tests.helpers import workers_in_this_process
 from tests.run_examples import write_run
@@ -383,7 +383,7 @@ def test_the_command_refuses_files_and_ports_in_use(tmp_path):
 def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
     monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 3)
     folder = write_run(tmp_path / "a", generations=20)
-    with sqlite3.connect(folder / "run.db") as connection:
+    with database(folder / "run.db") as connection:
         connection.execute("UPDATE history SET sha256 = '' WHERE generation BETWEEN 5 AND 9")
     reading = Reading(Runs([tmp_path]).find()[0])
     for _ in range(30):
@@ -397,7 +397,7 @@ def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
 def test_a_run_with_forged_data_hides_no_other(tmp_path):
     for name in ("a", "b"):
         write_run(tmp_path / name)
-    with sqlite3.connect(tmp_path / "a/run.db") as connection:
+    with database(tmp_path / "a/run.db") as connection:
         [text] = connection.execute("SELECT value FROM meta WHERE key = 'run'").fetchone()
         text = json.dumps(json.loads(text) | {"constants": {"task.environment": 3}})
         row = (text, text_sha256("run", text))

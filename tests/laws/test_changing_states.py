@@ -3,8 +3,6 @@ generation, through kills, reopened stores, damage of the newest generation, and
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 from dataclasses import replace
 from itertools import pairwise
 
@@ -26,6 +24,7 @@ from es_service.store.beginning import Beginning
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_evaluations, read_history, read_kept, read_parts
 from es_service.store.writer import RunStore
+from tests.database import database
 from tests.es_service.map_examples import PLANE
 from tests.es_service.store_examples import (
     CONFIG_YAML,
@@ -309,7 +308,7 @@ def test_damage_of_the_newest_generation_falls_back_to_the_one_before(tmp_path_f
         for before, state in zip([None, *states], states, strict=False):
             commit(store, state, before)
     expected = digest_parts(folder)
-    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
+    with database(folder / "run.db") as connection:
         newest = connection.execute("SELECT part FROM state WHERE generation = ?", (GENERATIONS - 1,)).fetchall()
         [part] = newest[chosen % len(newest)]
         how = ["payload = x'00'", "payload = x''", "sha256 = 'x'"][chosen % 3]

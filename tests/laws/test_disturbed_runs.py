@@ -57,6 +57,8 @@ CHANGES = {
 """Name -> settings of a run that are none of a method's own."""
 LONG = ("memes, elites measured again",)
 """Those that only `make long` runs."""
+QUICK = ("es", "map_elites", "memes")
+"""Those that `make quick` runs, too."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
 KEPT_PARENTS = 6
 """Parents of policies that a worker keeps: far fewer than it needs."""
@@ -153,7 +155,8 @@ class Shuffling(Engine[FaultyWorkers]):
 
 
 def named(name: str) -> object:
-    return pytest.param(name, marks=pytest.mark.long) if name in LONG else name
+    marks = pytest.mark.long if name in LONG else () if name in QUICK else pytest.mark.slow
+    return pytest.param(name, marks=marks)
 
 
 @pytest.fixture(scope="module", params=[named(name) for name in (*ALGORITHMS, *CHANGES)])

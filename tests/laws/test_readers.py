@@ -51,7 +51,12 @@ VARIANTS = {
     )
 }
 """Name -> method and settings of its runs besides those of the method."""
-METHODS = [*ALGORITHMS, "tests.laws.test_policies:mixed", *VARIANTS]
+QUICK = ("es", "map_elites", "memes")
+"""Methods that `make quick` reads, too."""
+METHODS = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    for name in (*ALGORITHMS, "tests.laws.test_policies:mixed", *VARIANTS)
+]
 
 
 @cache

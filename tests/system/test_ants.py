@@ -14,8 +14,6 @@ from tests.benchmarks import ants
 from tests.helpers import workers_in_this_process
 from tests.system.processes import children
 
-pytestmark = pytest.mark.slow
-
 
 def run(folder: Path, environment: str, workers: int, on_generation=lambda row: None, on_notice=pytest.fail):
     config = {
@@ -34,7 +32,8 @@ def run(folder: Path, environment: str, workers: int, on_generation=lambda row: 
     return api.run(api.load_config(config), folder, on_generation=on_generation, on_notice=on_notice)
 
 
-@pytest.mark.parametrize("environment", [pytest.param("ant_maze", marks=pytest.mark.long), "ant_trap"])
+@pytest.mark.long
+@pytest.mark.parametrize("environment", ["ant_maze", "ant_trap"])
 def test_one_worker_and_two_of_which_one_is_killed(tmp_path, environment):
     with workers_in_this_process():
         run(tmp_path / "one", environment, 1)

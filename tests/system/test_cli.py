@@ -84,6 +84,7 @@ def test_bench_scaling_predicts_a_row_per_number_of_workers():
     assert (code, "--workers 1,none: must be whole numbers" in printed) == (2, True)
 
 
+@pytest.mark.long
 @pytest.mark.alone
 def test_bench_scaling_predicts_a_method_that_asks_for_policies():
     """The last chunk of which is not full."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sqlite3
 import sys
 
 import pytest
@@ -18,6 +17,7 @@ from es_service.runs import evaluation
 from es_service.store.codec import text_sha256
 from es_service.store.digest import checked_parts
 from es_service.store.reader import read_platforms
+from tests.database import database
 from tests.system.command_line import es
 from tests.system.session import SMALL
 
@@ -212,14 +212,13 @@ def small(finished, tmp_path):
 
 def forget_the_code(folder):
     """As if a version that did not record code had computed the run."""
-    with sqlite3.connect(folder / "run.db") as connection:
+    with database(folder / "run.db") as connection:
         for at, text in connection.execute("SELECT generation, platform FROM platform").fetchall():
             fields = json.loads(text)
             del fields[CODE]
             text = json.dumps(fields, sort_keys=True)
             row = (text, text_sha256(f"platform {at}", text), at)
             connection.execute("UPDATE platform SET platform = ?, sha256 = ? WHERE generation = ?", row)
-    connection.close()
 
 
 def test_a_run_without_a_record_of_its_code_goes_on_and_has_one_from_then_on(small, monkeypatch):

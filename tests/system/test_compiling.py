@@ -52,8 +52,7 @@ class Point:
     def descriptor(self, state):
         return state
 '''
-ENGINES = ["inline", pytest.param("ray", marks=[pytest.mark.slow, pytest.mark.alone])]
-AND_AT_LENGTH = ["inline", pytest.param("ray", marks=[pytest.mark.long, pytest.mark.alone])]
+ENGINES = ["inline", pytest.param("ray", marks=[pytest.mark.long, pytest.mark.alone])]
 
 
 @pytest.fixture
@@ -85,7 +84,7 @@ def test_a_long_compilation_is_not_taken_for_a_long_chunk(tmp_path, run, engine)
     assert min(seconds["TrainingChunk"], seconds["EvaluationChunk"]) >= 4.0 > seconds["GradientChunk"]
 
 
-@pytest.mark.parametrize("engine", AND_AT_LENGTH)
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_compilation_that_takes_too_long_is_said_to_be_one(run, engine):
     with pytest.raises(EvaluationError) as caught:
         run(engine, compile_s=6.0, compile_timeout_s=1.0, max_attempts=1)
@@ -93,7 +92,7 @@ def test_a_compilation_that_takes_too_long_is_said_to_be_one(run, engine):
     assert "within 1 s (compute.compile_timeout_s)" in str(caught.value)
 
 
-@pytest.mark.parametrize("engine", AND_AT_LENGTH)
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_first_chunk_that_computes_for_too_long_is_said_to_compute(run, engine):
     with pytest.raises(EvaluationError) as caught:
         run(engine, compute_s=60.0, first_chunk_timeout_s=1.0, chunk_timeout_s=0.5, max_attempts=1)

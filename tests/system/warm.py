@@ -29,22 +29,22 @@ def _server() -> ForkServerContext:
 
 def run(words: Sequence[str], cwd: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     """Run a command to its end: as `subprocess.run`, without input. It is killed after ten minutes."""
-    return call(_command, list(words), str(cwd), dict(environment))
+    return call(be_program, list(words), str(cwd), dict(environment))
 
 
-def call(function: Callable[..., None], *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Call a function in a process of its own, to the end of both. It is killed after ten minutes."""
+def call(function: Callable[..., None], *arguments: object, limit_s: float = 600) -> subprocess.CompletedProcess[str]:
+    """Call a function in a process of its own, to the end of both. It is killed after `limit_s` seconds."""
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder, name) for name in ("out", "err")]
         for file in files:
             file.touch()
         process = _server().Process(target=_printing, args=(list(map(str, files)), function, *arguments))
         process.start()
-        process.join(600)
+        process.join(limit_s)
         if process.exitcode is None:
             process.kill()
             process.join()
-            raise subprocess.TimeoutExpired(repr(arguments), 600)
+            raise subprocess.TimeoutExpired(repr(arguments), limit_s)
         code = process.exitcode
         process.close()
         return subprocess.CompletedProcess(arguments, code, *(file.read_text() for file in files))
@@ -59,13 +59,26 @@ def _printing(files: list[str], function: Callable[..., None], *arguments: objec
     function(*arguments)
 
 
-def _command(words: list[str], cwd: str, environment: dict[str, str]) -> None:
-    """Be the program."""
+def be_program(words: list[str], cwd: str, environment: dict[str, str]) -> None:
+    """Be the program, in its process from now on."""
     from es_service.__main__ import main
 
+    _settle(cwd, environment, str(Path(words[0]).parent))
+    sys.argv = words
+    main()
+
+
+def be_script(code: str, cwd: str, environment: dict[str, str]) -> None:
+    """Be `python -c CODE`, in its process from now on."""
+    _settle(cwd, environment, "")
+    sys.argv = ["-c"]
+    exec(compile(code, "<string>", "exec"), {"__name__": "__main__"})
+
+
+def _settle(cwd: str, environment: dict[str, str], first: str) -> None:
+    """Have the folder, the environment and the `sys.path` of a program of which `first` is the folder."""
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
-    sys.path = [str(Path(words[0]).parent), *(path for path in sys.path if path not in ("", TESTED))]
-    sys.argv = words
-    main()
+    named = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
+    sys.path = [first, *named, *(path for path in sys.path if path not in ("", TESTED))]

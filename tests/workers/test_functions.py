@@ -81,6 +81,7 @@ def test_what_a_search_moves_is_half_ranges_and_the_start_is_where_it_begins():
     assert first_N_D.std(axis=0).min() > 0.5
 
 
+@pytest.mark.slow
 def test_an_es_climbs_a_hill_and_every_worker_says_the_same(tmp_path, no_jax):
     with workers_in_this_process():
         run = api.run(config_of(HILL, generations=60), tmp_path / "one").run
@@ -94,6 +95,7 @@ def test_an_es_climbs_a_hill_and_every_worker_says_the_same(tmp_path, no_jax):
     assert resumed.digest() == run.digest()
 
 
+@pytest.mark.slow
 def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
     config = config_of(HILL, MAP_ELITES, generations=8)
     with workers_in_this_process():
@@ -200,6 +202,7 @@ def test_a_call_that_ends_its_worker_each_time_is_named_with_its_parameters(tmp_
     np.testing.assert_allclose(np.float64(first), -np.float64(second), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hang", "exit"])
 @pytest.mark.usefixtures("one_process")
 def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(kind, tmp_path, monkeypatch):

@@ -67,6 +67,7 @@ def one_process():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", [ES, pytest.param(MAP_ELITES, marks=pytest.mark.long)], ids=["es", "map_elites"])
 def test_a_run_and_its_replays_are_those_of_simd(search, tmp_path, request):
     """PointMaze from its corner, whose reset draws nothing."""
@@ -218,6 +219,7 @@ def has_ended(process):
         return True
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_jax")
 @pytest.mark.parametrize(
     "fault",

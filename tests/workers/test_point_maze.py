@@ -18,6 +18,7 @@ step = jax.jit(ENVIRONMENT.step)
 steps = jax.jit(jax.vmap(ENVIRONMENT.step))
 
 
+@pytest.mark.slow
 def test_random_moves_equal_the_reference():
     rng = np.random.default_rng(0)
     count = 100_000

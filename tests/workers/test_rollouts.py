@@ -52,6 +52,7 @@ def test_a_run_and_its_replays_with_another_rollout_are_those_of_xla(search, tmp
     assert recordings.shapes == ()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("numpy_is_registered")
 def test_another_rollout_is_measured():
     rows = list(bench_rollouts(["point_maze"], rollouts=["numpy"], batches=[4], seconds=0.0))

@@ -76,7 +76,7 @@ def test_other_scatters_stay_and_drop_what_they_should(change):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["ant_maze", "brax:halfcheetah"])
+@pytest.mark.parametrize("task", ["ant_maze", pytest.param("brax:halfcheetah", marks=pytest.mark.long)])
 def test_a_step_of_physics_has_none_and_is_the_same(task):
     environment = make_environment(task, {})
     state = jax.jit(environment.reset)(np.arange(4, dtype=np.uint32))

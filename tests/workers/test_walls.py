@@ -52,6 +52,7 @@ def test_distance_is_the_least_to_any_wall(walls):
     assert checked > 300
 
 
+@pytest.mark.slow
 def test_a_foot_beside_a_wall():
     distance, normal, position = contact(ALONG_X, (2.0, 0.55, 0.1), (2.0, 1.0, 0.4))
     assert distance == pytest.approx(0.55 - 0.58)
@@ -66,6 +67,7 @@ def test_of_equally_near_points_the_foot_s_is_taken():
     np.testing.assert_allclose(normal, [0, 1, 0])
 
 
+@pytest.mark.slow
 def test_of_equally_near_walls_the_first_is_taken():
     walls = (((0.0, 0.0), (4.0, 0.0)), ((0.0, 2.0), (4.0, 2.0)))
     assert contact(walls, (2.0, 1.0, 0.1), (2.0, 1.0, 0.1))[1][1] == 1.0

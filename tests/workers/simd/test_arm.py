@@ -74,6 +74,7 @@ def as_words(tree: Any) -> np.ndarray:
     return np.concatenate([x.astype(np.uint32) if x.itemsize < 4 else x.copy().view(np.uint32) for x in rows])
 
 
+@pytest.mark.slow
 @ON_ARM
 @settings(GENTLE, max_examples=2)
 @given(data=st.data())

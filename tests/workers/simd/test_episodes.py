@@ -28,6 +28,7 @@ from workers.simd.episodes.layout import plan
 from workers.simd.episodes.noise import UNROLLED, fill_function
 
 
+@pytest.mark.slow
 def test_episodes_of_point_maze_are_xlas():
     """10,000 of them. The few that end elsewhere are at a wall's end or the goal's edge between two last bits: as many
     of xla's own do when its weights change by their last bit."""

@@ -31,10 +31,13 @@ PAIRS = 5
         {"policy": PolicySpec(widths=(2, 2))},
         {"policy": replace(POLICY, widths=(2, 16, 2))},
         {"policy": replace(POLICY, output="gaussian"), "action_noise": 0.1, "episodes_per_member": 2},
-        {"environment": "brax:inverted_pendulum", "policy": PolicySpec(widths=(4, 8, 1)), "episode_steps": 60},
+        pytest.param(
+            {"environment": "brax:inverted_pendulum", "policy": PolicySpec(widths=(4, 8, 1)), "episode_steps": 60},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"environment": "ant_trap", "policy": PolicySpec(widths=(113, 20, 8)), "episode_steps": 30},
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
     ],
     ids=str,

@@ -59,6 +59,7 @@ def primitives_of(jaxpr: Any) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_every_primitive_has_a_case() -> None:
     tested: set[str] = set()
 

@@ -51,8 +51,15 @@ def words_of(tree) -> np.ndarray:
     return np.ascontiguousarray(pack(leaves, len(leaves[0]))[0])
 
 
-@pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("task", "quick"),
+    [
+        ("point_maze", False),
+        ("point_maze", True),
+        pytest.param("ant_trap", False, marks=pytest.mark.long),
+        pytest.param("ant_trap", True, marks=pytest.mark.slow),
+    ],
+)
 def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, quick: bool, one: Target) -> None:
     physics, functions = physics_of(task), physics_functions(physics_of(task), one, quick=quick)
     rng, steps = np.random.default_rng(0), 5

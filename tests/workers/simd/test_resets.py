@@ -57,6 +57,7 @@ class Watched(Drift):
         return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [Drift, Keyed, Watched])
 def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
     name = f"{__name__}:{task.__name__}"
