@@ -58,8 +58,8 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files come in the order of how many slow tests they have, those that compile physics before the others, so that no
-    process of pytest-xdist begins one of those when the others have ended."""
+    """Files come in the order of how many slow tests they have, those that compile physics first, so that no process of
+    pytest-xdist begins one of those when the others have ended."""
     if hasattr(config, "workerinput"):
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: ("workers" not in item.path.parts, -slow[item.path]))
