@@ -1,7 +1,6 @@
 """Settings every test shares. Must run before anything imports jax: rollouts are compared at one XLA thread."""
 
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,16 +19,6 @@ os.environ["PJRT_NPROC"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # as in an activated environment
 
-IN_MEMORY = "/dev/shm"
-"""File system in memory in which the folders of tests are, if it is there: a run of a test need not wait for a disk.
-They stay there if a test failed."""
-ENOUGH_BYTES = 8 << 30
-
-
-def in_memory_bytes() -> int:
-    """Free bytes of that file system; none where it is missing."""
-    return shutil.disk_usage(IN_MEMORY).free if os.path.ismount(IN_MEMORY) else 0
-
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compiled code is shared by all processes of a test run, and kept for the next one: `--cache-clear` removes it.
@@ -45,24 +34,16 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["XDG_CACHE_HOME"] = str(folder)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "tests-xla")
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
-    if config.option.basetemp is None and not hasattr(config, "workerinput") and in_memory_bytes() > ENOUGH_BYTES:
-        config.option.basetemp = f"{IN_MEMORY}/es-service-tests-{os.geteuid()}-{os.getpid()}"
     if hasattr(config.option, "loadscopereorder"):  # pytest-xdist keeps the order of files, see below
         config.option.loadscopereorder = False
 
 
-def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    folder = session.config.option.basetemp
-    if exitstatus == 0 and str(folder).startswith(IN_MEMORY) and not hasattr(session.config, "workerinput"):
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files come in the order of how many slow tests they have, those that compile physics first, so that no process of
-    pytest-xdist begins one of those when the others have ended."""
+    """Files come in the order of how many slow tests they have, so that no process of pytest-xdist begins one of those
+    when the others have ended. The first one compiles what others then find in the cache."""
     if hasattr(config, "workerinput"):
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-        items.sort(key=lambda item: ("workers" not in item.path.parts, -slow[item.path]))
+        items.sort(key=lambda item: (item.path.name != "test_ant.py", -slow[item.path]))
 
 
 @pytest.fixture(scope="session")

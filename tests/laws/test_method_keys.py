@@ -242,8 +242,13 @@ def test_every_constant_is_measured_or_there_is_a_reason():
     assert known == OTHER.keys() | NOT_MEASURED.keys()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", OURS)
+AT_ONCE = ("es", "me_es", "map_elites")
+"""Methods whose keys are tried in `make test`, with and without populations, centres or a map; the others are long."""
+
+
+@pytest.mark.parametrize(
+    "method", [pytest.param(one, marks=pytest.mark.slow if one in AT_ONCE else pytest.mark.long) for one in OURS]
+)
 def test_the_table_says_which_keys_have_an_effect(method):
     settings = OURS[method].settings
     declared = {key: is_declared(key, settings) for key in OTHER if method not in ONE_VALUE.get(key, ())}

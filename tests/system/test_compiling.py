@@ -75,19 +75,19 @@ def run(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_long_compilation_is_not_taken_for_a_long_chunk(tmp_path, run, engine):
-    found = run(engine, compile_s=4.0, first_chunk_timeout_s=3.9, chunk_timeout_s=3.9)
+    found = run(engine, compile_s=2.5, first_chunk_timeout_s=2.4, chunk_timeout_s=2.4)
     assert found.history["lost_workers"].sum() == 0
     counts = check_dispatch(tmp_path / "run")
     assert counts["compiled"] == 3
     entries = read_dispatch_log(tmp_path / "run")
     seconds = {entry["kind"]: entry["seconds"] for entry in entries if entry["is"] == "Compiled"}
-    assert min(seconds["TrainingChunk"], seconds["EvaluationChunk"]) >= 4.0 > seconds["GradientChunk"]
+    assert min(seconds["TrainingChunk"], seconds["EvaluationChunk"]) >= 2.5 > seconds["GradientChunk"]
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_compilation_that_takes_too_long_is_said_to_be_one(run, engine):
     with pytest.raises(EvaluationError) as caught:
-        run(engine, compile_s=6.0, compile_timeout_s=1.0, max_attempts=1)
+        run(engine, compile_s=3.0, compile_timeout_s=1.0, max_attempts=1)
     assert "did not finish compiling for work item EvaluationChunk 0 of generation 0" in str(caught.value)
     assert "within 1 s (compute.compile_timeout_s)" in str(caught.value)
 

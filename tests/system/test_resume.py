@@ -31,11 +31,11 @@ def test_a_longer_budget_stays_with_the_run(config, tmp_path):
     """`resume` with a budget, killed: a plain `resume` then goes on to that budget, not to the first one."""
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
-    with running(PROGRAM, "resume", folder, "--set", "budget.generations=400") as process:
+    with running(PROGRAM, "resume", folder, "--set", "budget.generations=200") as process:
         wait_until(process, lambda: (read_generation(folder) or 0) >= 4)
-    assert (read_generation(folder) or 0) < 400
+    assert (read_generation(folder) or 0) < 200
     assert es("resume", folder)[0] == 0
-    assert read_generation(folder) == 400
+    assert read_generation(folder) == 200
 
 
 def test_resume_of_a_finished_run_does_nothing(finished, tmp_path):

@@ -99,6 +99,7 @@ def opened(page, address, name, **window):
     return key
 
 
+@pytest.mark.long
 def test_a_run_that_goes_on_is_killed_and_is_resumed_is_seen(page, tmp_path):
     folder = tmp_path / "runs/a"
     (tmp_path / "runs").mkdir()

@@ -145,16 +145,9 @@ def test_an_output_that_does_not_exist_is_named(spec):
         chunk_runner(spec(outputs=("succes",)))(centre(random_parameters()), EvaluationChunk(1, 0))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("task", "rollout"),
-    [
-        ("ant_trap", "simd"),
-        pytest.param("ant_maze", "simd", marks=pytest.mark.long),
-        pytest.param("ant_trap", "xla", marks=pytest.mark.long),
-        pytest.param("ant_maze", "xla", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("rollout", ["simd", "xla"])
+@pytest.mark.parametrize("task", ["ant_trap", "ant_maze"])
 def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task, rollout):
     shape = PolicySpec((SHIPPED[task].observation_size, 8, SHIPPED[task].action_size))
     worker_spec = replace(task_spec(task), policy=shape, episode_steps=50, rollout=rollout)

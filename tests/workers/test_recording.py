@@ -24,7 +24,7 @@ def spec_of(name, rollout, steps):
 
 
 TASKS = [("point_maze", 200, "xla"), ("point_maze", 200, "simd")]
-TASKS += [pytest.param("ant_trap", 60, "simd", marks=pytest.mark.slow)]
+TASKS += [pytest.param("ant_trap", 60, "simd", marks=pytest.mark.long)]
 FOUR_TIMES = [pytest.mark.long, pytest.mark.timeout(3600)]  # XLA compiles the ant
 TASKS += [pytest.param("ant_trap", 60, "xla", marks=FOUR_TIMES)]
 

@@ -75,8 +75,8 @@ def test_other_scatters_stay_and_drop_what_they_should(change):
     np.testing.assert_array_equal(jax.vmap(dense)(rows), jax.vmap(changed)(rows))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ["ant_maze", pytest.param("brax:halfcheetah", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("task", ["ant_maze", "brax:halfcheetah"])
 def test_a_step_of_physics_has_none_and_is_the_same(task):
     environment = make_environment(task, {})
     state = jax.jit(environment.reset)(np.arange(4, dtype=np.uint32))

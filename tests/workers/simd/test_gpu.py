@@ -33,7 +33,7 @@ PAIRS = 5
         {"policy": replace(POLICY, output="gaussian"), "action_noise": 0.1, "episodes_per_member": 2},
         pytest.param(
             {"environment": "brax:inverted_pendulum", "policy": PolicySpec(widths=(4, 8, 1)), "episode_steps": 60},
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
         pytest.param(
             {"environment": "ant_trap", "policy": PolicySpec(widths=(113, 20, 8)), "episode_steps": 30},

@@ -64,8 +64,7 @@ def reference_of(name: str) -> list[np.ndarray]:
     "name",
     [
         "point_maze",
-        pytest.param("ant_trap", marks=pytest.mark.slow),
-        pytest.param("ant_maze", marks=pytest.mark.long),
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("ant_trap", "ant_maze")),
     ],
 )
 def test_bits_are_the_references_on_every_target(name: str, target: Target) -> None:

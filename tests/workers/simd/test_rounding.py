@@ -83,7 +83,7 @@ class Products:
         (f"{__name__}:Products", "final"),
         ("point_maze", "sum"),
         ("point_maze", "final"),
-        pytest.param("ant_trap", "sum", marks=pytest.mark.slow),
+        pytest.param("ant_trap", "sum", marks=pytest.mark.long),
         pytest.param("ant_maze", "final", marks=pytest.mark.long),
         pytest.param("brax:hopper", "sum", marks=pytest.mark.long),
     ],
