@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from es_service.protocol.messages import PolicySpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
-from tests.workers.steps import of_many, resets_of, steps_of
+from tests.workers.steps import control_step, of_many
 from workers.environments import (
     TaskError,
     brax_parts,
@@ -60,18 +62,20 @@ POINT = f"{__name__}:Slalom"
 
 
 def test_rewards_and_observations_are_brax_s():
+    """Both in one program, of which XLA compiles what they share once."""
     name = "inverted_double_pendulum"
     task, environment = brax_task.describe(name), brax_task.make(name)
     theirs = brax_task._make_brax(name, "spring")
-    raw = of_many(lambda key: theirs.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32")))(KEYS)
-    raw_step = of_many(theirs.step)
-    state, rewards = resets_of(f"brax:{name}")(KEYS), []
+    key_of = partial(jax.random.wrap_key_data, impl="threefry2x32")
+    both = of_many(lambda key: (environment.reset(key), theirs.reset(key_of(key[:2]))))
+    step = control_step(environment)
+    both_steps = of_many(lambda mine, raw, action: (step(mine, action), theirs.step(raw, jnp.clip(action, -1, 1))))
+    (state, raw), rewards = both(KEYS), []
     rng = np.random.default_rng(0)
     assert environment.observe(state).shape == (3, task.observation_size)
     for _ in range(10):
         action = rng.uniform(-1.5, 1.5, (3, task.action_size)).astype(np.float32)
-        state, reward, done, observation, descriptor, _ = steps_of(f"brax:{name}")(state, action)
-        raw = raw_step(raw, np.clip(action, -1, 1))
+        (state, reward, done, observation, descriptor, _), raw = both_steps(state, raw, action)
         np.testing.assert_allclose(reward, raw.reward, rtol=1e-4, atol=1e-4)
         np.testing.assert_array_equal(done, raw.done > 0.5)
         np.testing.assert_allclose(observation, raw.obs, rtol=1e-3, atol=1e-4)
