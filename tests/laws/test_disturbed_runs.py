@@ -27,6 +27,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.helpers import worker_here
+from tests.laws.test_readers import QUICK
 from tests.laws.test_readers import config_of as config_of_method
 from tests.laws.test_recipes import Worker
 
@@ -57,8 +58,6 @@ CHANGES = {
 """Name -> settings of a run that are none of a method's own."""
 LONG = ("memes, elites measured again",)
 """Those that only `make long` runs."""
-QUICK = ("es", "map_elites", "memes")
-"""Those that `make quick` runs, too."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
 KEPT_PARENTS = 6
 """Parents of policies that a worker keeps: far fewer than it needs."""

@@ -52,7 +52,7 @@ VARIANTS = {
 }
 """Name -> method and settings of its runs besides those of the method."""
 QUICK = ("es", "map_elites", "memes")
-"""Methods that `make quick` reads, too."""
+"""Methods that `make quick` tries, too."""
 METHODS = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
     for name in (*ALGORITHMS, "tests.laws.test_policies:mixed", *VARIANTS)
