@@ -84,18 +84,29 @@ def test_killed_during_a_wal_checkpoint(tmp_path, reference):
 def test_killed_during_start_up(tmp_path, reference):
     """At any instant from nothing to the first commit: either there is no run yet, or it can be resumed. What is left
     of a folder before keeps nobody from starting the run in it."""
-    begun, delay_s = [], 0.1
-    while begun.count(True) < 3:  # later and later, until three kills have come after the run's creation
-        folder = tmp_path / f"run{len(begun)}"
+    kills = 0
+
+    def killed(after_s: float, *, since_creation: bool) -> bool:
+        """Kill a session of its own at that instant, and finish what it has begun; whether a run had begun."""
+        nonlocal kills
+        kills += 1
+        folder = tmp_path / f"run{kills}"
         with start(folder, config=SMALL) as process:
-            time.sleep(delay_s)
-            assert process.poll() is None
-        begun.append((folder / "run.db").exists())
+            if since_creation:
+                wait_until(process, (folder / "run.db").exists)
+            time.sleep(after_s)
+        begun = (folder / "run.db").exists()
         if folder.exists():
-            assert finish(folder, config=None if begun[-1] else SMALL) == 0
+            assert finish(folder, config=None if begun else SMALL) == 0
             assert digest_parts(folder) == reference
+        return begun
+
+    delay_s = 0.1
+    while not killed(delay_s, since_creation=False):  # later and later, until one comes after the run's creation
         delay_s *= 1.3
-    assert begun.count(False) >= 3
+    assert kills >= 4
+    for after_s in (0.0, 0.01, 0.03):
+        assert killed(after_s, since_creation=True)
 
 
 @pytest.mark.long
