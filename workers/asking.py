@@ -121,7 +121,7 @@ def _members(
     actions_P_S_E: Any,
 ) -> tuple[Any, ...]:
     """Columns of `Rows`: all episodes of the first member, of the second, ..., from keys [P, S, E, 4]."""
-    parameters_M_D = members(centre_D, unit, noise_P).reshape(-1, spec.policy.parameters)
+    parameters_M_D = members(spec, centre_D, unit, noise_P).reshape(-1, spec.policy.parameters)
     parameters_N_D = np.repeat(parameters_M_D, resets_P_S_E.shape[2], axis=0)
     columns = _quiet(parameters_N_D, mean_O, std_O, resets_P_S_E.reshape(-1, KEY_WORDS))
     return (*columns[:4], actions_P_S_E.reshape(-1, KEY_WORDS), np.ones(len(parameters_N_D), bool))
@@ -171,5 +171,5 @@ class _Arguments(Asked):
         def nothing(*_: Any) -> None:
             return None
 
-        functions = (nothing, nothing, nothing, gradient_summer(spec.policy.parameters))
+        functions = (nothing, nothing, nothing, gradient_summer(spec))
         return ChunkFunctions(*(Compilable(function, nothing) for function in functions))

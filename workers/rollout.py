@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from es_service.protocol.outputs import OF_STEPS
@@ -25,6 +26,7 @@ from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
+from workers.policies.low_rank import act_low_rank
 from workers.policies.pairs import act_in_pairs
 from workers.policies.policy import act, split_layers
 
@@ -42,17 +44,21 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec, *, in_pair
     """
     episodes = _make_member_episodes(environment, spec)
     block_pairs = spec.rollout_block_pairs
-    coordinates_D = np.arange(spec.policy.parameters, dtype=np.uint32)
+    rank = spec.noise_rank
+    drawn = numbers(spec.policy, rank) if rank else spec.policy.parameters
+    coordinates_N = np.arange(drawn, dtype=np.uint32)
     signs_S = np.asarray(SIGNS, np.float32)
 
     def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
         def block(keys):
             noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E = keys
-            noise_P_D = jax.vmap(lambda key: normal_integers(jnp, key, coordinates_D))(noise_keys_P)
-            if in_pairs:
-                policies = act_in_pairs(spec.policy, centre_D, unit, noise_P_D)
+            noise_P_N = jax.vmap(lambda key: normal_integers(jnp, key, coordinates_N))(noise_keys_P)
+            if rank:
+                policies = act_low_rank(spec.policy, rank, centre_D, unit, noise_P_N.astype(jnp.float32))
+            elif in_pairs:
+                policies = act_in_pairs(spec.policy, centre_D, unit, noise_P_N)
             else:
-                offset_P_D = unit * noise_P_D.astype(jnp.float32)
+                offset_P_D = unit * noise_P_N.astype(jnp.float32)
                 parameters_P_S_D = centre_D + signs_S[None, :, None] * offset_P_D[:, None, :]
                 policies = _act_each(spec.policy, parameters_P_S_D.reshape(2 * block_pairs, -1))
             result_PS = episodes(
@@ -146,6 +152,28 @@ def make_gradient_sum(parameters: int) -> Compilable:
 
         sum_D = lax.fori_loop(0, weights_P.shape[0], add_pair, jnp.zeros(parameters, jnp.float32))
         return sum_D * np.float32(1.0 / NORMAL_STD)
+
+    return jitted(gradient_sum)
+
+
+def make_low_rank_gradient_sum(policy: PolicySpec, rank: int) -> Compilable:
+    """Sum of weighted noise of low rank of one block of pairs, with the interface of `make_gradient_sum`.
+
+    The sum over the pairs of a block is one matrix product for each layer.
+    """
+    coordinates_N, layers = np.arange(numbers(policy, rank), dtype=np.uint32), layers_of_noise(policy, rank)
+    of_numbers, of_products = np.float32(1.0 / NORMAL_STD), np.float32(product_unit(rank) / NORMAL_STD)
+
+    def gradient_sum(weights_P, noise_keys_P):
+        drawn_P_N = jax.vmap(lambda key: normal_integers(jnp, key, coordinates_N))(noise_keys_P).astype(jnp.float32)
+        weighted_P_N, parts = weights_P[:, None] * drawn_P_N, []
+        for left, right, bias in layers:
+            left_PR_I, right_PR_J = (
+                drawn[:, at].reshape(-1, at.shape[1]) for drawn, at in ((weighted_P_N, left), (drawn_P_N, right))
+            )
+            parts.append((left_PR_I.T @ right_PR_J).reshape(-1) * of_products)
+            parts += [] if bias is None else [weighted_P_N[:, bias].sum(axis=0) * of_numbers]
+        return jnp.concatenate(parts)
 
     return jitted(gradient_sum)
 

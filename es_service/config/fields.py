@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from es_service.protocol.low_rank import MOST_RANK
 from es_service.protocol.messages import Bounds
 
 TASK_OPTIONS = "task.options."
@@ -31,6 +32,7 @@ def _tuples(value: Any) -> Any:
 
 
 Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
+Rank = Annotated[int, Field(ge=1, le=MOST_RANK), f"a whole number from 1 to {MOST_RANK}"]
 Positive = Annotated[float, Field(gt=0), "a number above 0"]
 Patience = Annotated[float, Field(ge=20), "a number, at least 20"]
 NotNegative = Annotated[float, Field(ge=0), "a number, at least 0"]

@@ -260,6 +260,7 @@ def worker_spec(
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
+        noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
         outputs=tuple(sorted({*outputs, *search.outputs()})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
         sources=worker_sources(settings.environment),

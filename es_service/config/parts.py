@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Point, Positive, Section, as_tuple
+from es_service.config.fields import Count, Fraction, NotNegative, Point, Positive, Rank, Section, as_tuple
 
 
 class AdamStep(Section):
@@ -57,6 +57,22 @@ class ClipUpStep(Section):
         description="Of kind clipup: greatest length of a step, in parameter units; null: learning_rate / 0.75.",
     )
     momentum: Fraction = Field(0.9, description="Of kind clipup: share of the velocity that a step keeps.")
+
+
+class FullNoise(Section):
+    """Each parameter has a normal number of its own."""
+
+    kind: Literal["full"] = "full"
+
+    rank: ClassVar[int] = 0
+    """That of `WorkerSpec.noise_rank`."""
+
+
+class LowRankNoise(Section):
+    """Each weight matrix moves along a product of two thin matrices of normal numbers."""
+
+    kind: Literal["low_rank"] = "low_rank"
+    rank: Rank = Field(1, description="Of kind low_rank: columns of the thin matrices.")
 
 
 class Ranks(Section):
@@ -254,6 +270,7 @@ class ArchiveSamplingCentres(Measured):
 Elites = Once | Extract | ArchiveSampling | ExplicitSampling | DeepGrid
 ElitesOfCentres = Once | ExtractCentres | ArchiveSamplingCentres
 Step = AdamStep | AdamWStep | PlainStep | ClipUpStep
+Noise = FullNoise | LowRankNoise
 Shaping = Ranks | Signs | Returns | TopPairs
 Objective = (
     FitnessObjective

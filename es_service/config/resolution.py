@@ -194,6 +194,9 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if (limit := values.get("task.time_limit_s")) is not None and task.kind == "jax":
         why = f" for {task.name}, whose steps take equal times"
         problems.append(not_allowed("task.time_limit_s", limit, "null", why=why))
+    if (noise := values.get("search.noise.kind", "full")) != "full" and task.parameters is not None:
+        why = f" for {task.name}, whose parameters are no matrices"
+        problems.append(not_allowed("search.noise.kind", noise, "full", why=why))
     return problems
 
 
@@ -327,14 +330,15 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
         for name in faster
         if task.kind in rollouts[name].task_kinds and (why := why_not(rollouts[name], task, shape, here=here))
     ]
-    has_pairs = isinstance(config.search, PopulationConfig)
-    if config.compute.worker_resources.gpu and rollouts[chosen].gpus_only_train and not has_pairs:
-        method = config.search.algorithm
-        warnings.append(
-            f"{RESOURCES}gpu: {method} has no training episodes, which are all that {chosen} computes on a GPU; the "
-            "rest is computed on the CPU"
-        )
-    pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
+    search = config.search
+    if config.compute.worker_resources.gpu and rollouts[chosen].gpus_only_train:
+        only = f"training episodes, which are all that {chosen} computes on a GPU"
+        if not isinstance(search, PopulationConfig):
+            warnings.append(f"{RESOURCES}gpu: {search.algorithm} has no {only}; the rest is computed on the CPU")
+        elif search.noise.kind != "full":
+            without = f"search.noise.kind = {search.noise.kind} is not for {only}; all is computed on the CPU"
+            warnings.append(f"{RESOURCES}gpu: {without}")
+    pairs = search.pairs if isinstance(search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
     if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].pair_limits(task)[0]) and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS

@@ -11,7 +11,17 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Share, Switch, Text
-from es_service.config.parts import AdamStep, FitnessObjective, Objective, Ranks, Shaping, Step, outputs_of
+from es_service.config.parts import (
+    AdamStep,
+    FitnessObjective,
+    FullNoise,
+    Noise,
+    Objective,
+    Ranks,
+    Shaping,
+    Step,
+    outputs_of,
+)
 from es_service.config.presets import PresetRow
 
 
@@ -98,6 +108,13 @@ class PopulationConfig(SearchConfig):
         "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
+    noise: Noise = Field(
+        FullNoise(),
+        discriminator="kind",
+        description="What a member adds to the parameters of a centre, times sigma. full: a normal number for each "
+        "parameter. low_rank: for each weight matrix a product of two thin matrices of normal numbers, which costs "
+        "less the wider the layers are; biases have a normal number each.",
+    )
     sigma_decay: Share = Field(
         1.0, description="Factor by which sigma changes in each generation; 1 keeps it. EvoJAX has 0.999."
     )

@@ -120,6 +120,8 @@ class WorkerSpec:
     """Pairs whose weighted noise is summed into one partial gradient."""
     rollout: str
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
+    noise_rank: int = 0
+    """Rank of the noise of each weight matrix, as in `low_rank.py`; 0: each parameter has a number of its own."""
     descriptor: DescriptorChoice | None = None
     """Descriptor that the config chooses; None: that of the task."""
     time_limit_s: float | None = None

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -51,6 +52,8 @@ def memory_bytes() -> tuple[int, bool]:
 
 def peak_memory_mib() -> int:
     """The most memory that this process has had so far, in MiB."""
+    with suppress(OSError, IndexError):  # the kernel's count for getrusage begins with that of the process before it
+        return round(int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) / 1024)
     unit = 1024 if sys.platform == "darwin" else 1  # bytes there, KiB elsewhere
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit / 1024)
 

@@ -77,6 +77,7 @@ OTHER = {
     "search.sigma": 0.3,
     "search.sigma_decay": 0.8,
     "search.sigma_limit": 0.19,
+    "search.noise.kind": "low_rank",
     "search.step.learning_rate": 0.3,
     "search.step.l2": 0.1,
     "search.step.kind": "plain",

@@ -23,9 +23,9 @@ from workers.policies.policy import act, split_layers
 
 
 def arrays(run: Run) -> list[np.ndarray]:
-    """All that a run keeps, as arrays."""
+    """All that a run keeps, as arrays; QDax has a Python float among them, which JAX computes with as float32."""
     state = (run._repertoire, run._emitter, run._key) if isinstance(run, MapRun) else run._state
-    return [np.array(leaf) for leaf in jax.tree.leaves(state)]
+    return [np.array(jnp.asarray(leaf)) for leaf in jax.tree.leaves(state)]
 
 
 def same(found: list[np.ndarray], expected: list[np.ndarray]) -> bool:

@@ -89,7 +89,7 @@ def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults
         *sound, note = printed.splitlines()
         assert [line[:6] for line in sound] == ["  ok  "] * 3
         assert sound[0] == f"  ok  2 of 2 nodes answer: head {hosts.ip(0)}, one {hosts.ip(1)}"
-        assert sound[2].endswith(f": head {hosts.ip(0)}:6379, dashboard {hosts.ip(0)}:8265")
+        assert sound[2].endswith(f": head {hosts.ip(0)}:6379, dashboard 127.0.0.1:8265")
         assert note.startswith(f"note  {NOT_ENCRYPTED}")
 
         edited = {
@@ -125,7 +125,7 @@ def test_a_cluster_without_a_token_is_found(tmp_path):
     with hosts:
         hosts.start("one", 1)
         wait_for(lambda: has_dashboard(hosts), 120.0)
-        servers = f"head {hosts.ip(0)}:6379, dashboard {hosts.ip(0)}:8265"
+        servers = f"head {hosts.ip(0)}:6379, dashboard 127.0.0.1:8265"
         assert findings(hosts, code=1) == [f"{servers}: Ray answers without a token", NOT_ENCRYPTED]
 
 

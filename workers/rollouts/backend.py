@@ -93,7 +93,7 @@ class ChunkFunctions(NamedTuple):
     training: Compilable
     """Function (centre_D, unit, mean_O, std_O, noise_keys_P_4, reset_keys_P_S_E_4, action_keys_P_S_E_4) -> Episodes
     with leading axes [P, S, E], of the members centre + sign * unit * noise with action noise; `unit` is
-    sigma / NORMAL_STD, and the noise is that of `protocol.noise.normal_integers`."""
+    sigma / NORMAL_STD, and the noise is that of `protocol.low_rank.noise_integers`."""
     evaluation: Compilable
     """Function (centre_D, mean_O, std_O, reset_keys_E_4, wanted_E) -> Episodes with leading axis [E], without action
     noise. Those that are not wanted need not be computed, and their results may be anything."""
@@ -102,8 +102,8 @@ class ChunkFunctions(NamedTuple):
     action noise. The policies are a list of parameters [N, D] and of recipes with their parents; policy_L is the number
     of each lane's policy among all."""
     gradient_sum: Compilable
-    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added
-    one by one in the order of their ids, so that the float32 bits depend on nothing else."""
+    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x the noise with standard deviation 1, [D]. How
+    the pairs of a block are added depends on nothing but their number, and so do the float32 bits."""
 
 
 class RolloutBackend(Rollout, Protocol):

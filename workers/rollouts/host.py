@@ -55,7 +55,7 @@ class Host(RolloutBackend):
         run, count = make_runner(spec), spec.policy.parameters
 
         def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
-            parameters_L_D = members(centre_D, unit, noise_keys_P).reshape(-1, count)
+            parameters_L_D = members(spec, centre_D, unit, noise_keys_P).reshape(-1, count)
             keys_E_L = (_by_episode(keys) for keys in (reset_keys_P_S_E, action_keys_P_S_E))
             by_episode = [run(parameters_L_D, mean_O, std_O, *keys) for keys in zip(*keys_E_L, strict=True)]
             return _stacked(by_episode).map(lambda array: array.reshape(len(noise_keys_P), 2, *array.shape[1:]))
@@ -66,7 +66,7 @@ class Host(RolloutBackend):
         def policies(given, mean_L_O, std_L_O, policy_L, reset_keys_L):
             return run(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L)
 
-        functions = (training, evaluation, policies, gradient_summer(count))
+        functions = (training, evaluation, policies, gradient_summer(spec))
         return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:

@@ -48,7 +48,7 @@ class Simd(RolloutBackend):
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.simd.episodes.rollout`."""
-        from workers.simd.episodes import rollout
+        from workers.simd.episodes import low_rank_gradient, rollout
 
         gpu = on_gpu()
         if gpu:
@@ -57,7 +57,8 @@ class Simd(RolloutBackend):
             jax.config.update("jax_platforms", "cpu")  # JAX only traces here, and need not know the GPU
         environment = environments.make_environment(spec.environment, spec.environment_options)
         elsewhere = None
-        if gpu and not set(spec.outputs) & set(OF_STEPS):  # which the code for GPUs does not keep
+        # The code for GPUs keeps no outputs of steps, and has no noise of low rank.
+        if gpu and not set(spec.outputs) & set(OF_STEPS) and not spec.noise_rank:
             from workers.simd.gpu.rollout import episodes_on_gpu
 
             elsewhere = episodes_on_gpu(environment, spec)
@@ -65,7 +66,9 @@ class Simd(RolloutBackend):
             rollout.make_training_rollout(environment, spec, elsewhere),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
-            rollout.make_gradient_sum(spec.policy.parameters),
+            low_rank_gradient.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
+            if spec.noise_rank
+            else rollout.make_gradient_sum(spec.policy.parameters),
         )
 
     def device(self) -> str:

@@ -39,7 +39,9 @@ class Xla(RolloutBackend):
             rollout.make_training_rollout(environment, spec, in_pairs=gpu),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
-            rollout.make_gradient_sum(spec.policy.parameters),
+            rollout.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
+            if spec.noise_rank
+            else rollout.make_gradient_sum(spec.policy.parameters),
         )
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:

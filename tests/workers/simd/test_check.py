@@ -5,6 +5,7 @@ Right code passes; wrong code is found and not kept.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -43,6 +44,26 @@ def test_policies_of_all_shapes_have_the_bits_of_their_reference(hidden, kind, t
         **kind,
     )
     assert checked == [None]
+
+
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize(("hidden", "rank"), [((), 2), ((16,), 1), ((33, 48), 3), ((144,), 1)], ids=str)
+def test_members_with_noise_of_low_rank_have_the_bits_of_their_reference(
+    hidden, rank, bias, target, tmp_path: Path
+) -> None:
+    shape = spec(policy=PolicySpec((2, *hidden, 2), bias=bias), noise_rank=rank)
+    given = (make_environment("point_maze", {}), shape, np.arange(2))
+    compile_episodes(*given, training=True, target=target, folder=tmp_path, check=check_episodes)
+    for wrong in (replace(shape, noise_rank=rank + 1), replace(shape, noise_rank=0)):
+        with pytest.raises(WrongCodeError):
+            compile_episodes(
+                *given,
+                training=True,
+                target=target,
+                folder=tmp_path / "other",
+                check=lambda kernel, program, wrong=wrong: check_episodes(replace(kernel, spec=wrong), program),
+            )
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from workers.simd.backend.target import Target, target_of
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.layout import plan
+from workers.simd.episodes.low_rank_gradient import make_low_rank_gradient_sum
 from workers.simd.episodes.noise import UNROLLED, fill_function
 
 
@@ -74,6 +75,7 @@ def test_a_few_steps_of_the_ants_are_xlas(task: str):
     np.testing.assert_allclose(ours.shifted_square_sum_O, theirs.shifted_square_sum_O, rtol=1e-2, atol=2e-2)
 
 
+@pytest.mark.parametrize("rank", [0, 2])
 @pytest.mark.parametrize(
     ("task", "training", "pairs", "hidden"),
     [
@@ -89,12 +91,12 @@ def test_a_few_steps_of_the_ants_are_xlas(task: str):
         pytest.param("ant_trap", True, 5, (256, 256), marks=pytest.mark.slow),
     ],
 )
-def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int, hidden: tuple[int, ...]):
+def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int, hidden: tuple[int, ...], rank: int):
     """AVX-512 and AVX2 give one digest; and an episode does not see who is beside it, or that a lane is empty."""
     environment = make_environment(task, {})
     worker_spec = dataclasses.replace(task_spec(task), episode_steps=20)
     shape = PolicySpec((worker_spec.policy.widths[0], *hidden, worker_spec.policy.widths[-1]))
-    worker_spec = dataclasses.replace(worker_spec, policy=shape)
+    worker_spec = dataclasses.replace(worker_spec, policy=shape, noise_rank=rank)
     centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec, 3.0)
     found = []
     for target in targets():
@@ -165,6 +167,15 @@ def test_gradient_sums_are_the_same_on_every_target_and_right(parameters: int, t
     first, found = (rollout.make_gradient_sum(parameters, one)(weights_P, keys_P) for one in (targets()[0], target))
     k = np.stack([normal_integers(np, key, np.arange(parameters, dtype=np.uint32)) for key in keys_P])
     np.testing.assert_allclose(found, weights_P.astype(float) @ k / NORMAL_STD, atol=1e-5)
+    np.testing.assert_array_equal(found, first)
+
+
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+@pytest.mark.parametrize(("widths", "rank"), [((3, 2), 2), ((2, 70, 8), 1)], ids=str)
+def test_gradients_of_low_rank_are_the_same_on_every_target(widths: tuple[int, ...], rank: int, target: Target):
+    policy, weights_P = PolicySpec(widths), np.random.default_rng(0).normal(size=5).astype(np.float32)
+    keys_P = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(5))
+    first, found = (make_low_rank_gradient_sum(policy, rank, one)(weights_P, keys_P) for one in (targets()[0], target))
     np.testing.assert_array_equal(found, first)
 
 

@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
+from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from workers.simd.backend.words import Words, aligned, pack
 from workers.simd.episodes import reference
@@ -59,19 +60,22 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
         memory, weights = kernel.network.room_for_own(LANES, spec.policy.parameters)
         memory[...] = parameters_L_D
         weights_of = reference.own(memory)
-    elif noise_keys_P is not None:
+    elif noise_keys_P is not None and not spec.noise_rank:
         weights_of = reference.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
         weights = kernel.network.pack(parameters_L_D[0])
     else:
         weights, weights_of = kernel.network.pack(parameters_L_D[0]), reference.shared(parameters_L_D[0], LANES)
 
+    moved = {}
+    if noise_keys_P is not None and spec.noise_rank:
+        moved["moved"] = reference.low_rank(spec.policy, spec.noise_rank, np.float32(UNIT), noise_keys_P)
     carries, go = kernel.started(weights, UNIT, mean_O, std_O, noise_keys_P, keys_L, keys_L)
     carry_L = _by_lane(carries)
     go(1)
     (normalised_observation, _, seen), (advance, _, after) = program.graphs()
     statistics = [np.broadcast_to(x[:, inputs_O], (LANES, len(inputs_O))).T.view(np.uint32) for x in (mean_O, std_O)]
     x_I_L = np.stack(evaluate(normalised_observation, seen, np.concatenate([carry_L, *statistics])))
-    action_A_L = reference.policy(spec.policy, inputs_O, x_I_L, weights_of)
+    action_A_L = reference.policy(spec.policy, inputs_O, x_I_L, weights_of, **moved)
     words = np.concatenate([carry_L, statistics[0], action_A_L.view(np.uint32), keys_L.T])
     require_same(_by_lane(carries), _words(evaluate(advance, after, words)), f"a step of {spec.environment}")
 
@@ -86,6 +90,28 @@ def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> 
         sums_D = compute("fma", [np.full_like(k_D, weight), k_D, sums_D])
     wanted_D = compute("mul", [sums_D, np.full_like(sums_D, 1.0 / NORMAL_STD)])
     require_same(gradient_sum(weights_P, keys_P)[:parameters], wanted_D, "a gradient")
+
+
+def check_low_rank_gradient(gradient_sum: Callable[..., np.ndarray], policy: PolicySpec, rank: int) -> None:
+    """Raise WrongCodeError unless a sum of noise of low rank over a few pairs has the bits of its definition."""
+    keys_P = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(3))
+    weights_P = np.random.default_rng(0).normal(size=3).astype(np.float32)
+    coordinates_N = np.arange(numbers(policy, rank), dtype=np.uint32)
+    k_P_N = np.stack([normal_integers(np, key, coordinates_N) for key in keys_P]).astype(np.float32)
+    wanted: list[np.ndarray] = []
+    for left_R_I, right_R_J, bias_J in layers_of_noise(policy, rank):
+        shape = left_R_I.shape[1], right_R_J.shape[1]
+        sums_I_J, sums_J = np.zeros(shape, np.float32), np.zeros(shape[1], np.float32)
+        for weight, k_N in zip(weights_P, k_P_N, strict=True):
+            for left_I, right_J in zip(left_R_I, right_R_J, strict=True):
+                weighted_I = compute("mul", [np.full_like(k_N[left_I], weight), k_N[left_I]])
+                sums_I_J = compute("fma", [*np.broadcast_arrays(weighted_I[:, None], k_N[right_J]), sums_I_J])
+            if bias_J is not None:
+                sums_J = compute("fma", [np.full(shape[1], weight), k_N[bias_J], sums_J])
+        of_products = np.float32(product_unit(rank) / NORMAL_STD)
+        wanted.append(compute("mul", [sums_I_J, np.full_like(sums_I_J, of_products)]).reshape(-1))
+        wanted += [] if bias_J is None else [compute("mul", [sums_J, np.full_like(sums_J, 1.0 / NORMAL_STD)])]
+    require_same(gradient_sum(weights_P, keys_P), np.concatenate(wanted), "a gradient of low rank")
 
 
 def require_same(found: np.ndarray, wanted: np.ndarray, what: str, where: str = "this processor") -> None:

@@ -24,6 +24,7 @@ from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, Words, aligned, filled, pack, require, unpack, words_of
 from workers.simd.episodes.kernel import Check, compile_resets, no_check
 from workers.simd.episodes.layout import Network
+from workers.simd.episodes.low_rank import LowRankNoise
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
 
 
@@ -38,6 +39,8 @@ class EpisodeKernel:
     inputs_O: np.ndarray
     """Indices of the observations that are computed, as inputs of the policy."""
     network: Network
+    low_rank: LowRankNoise | None
+    """Layout of the noise of training episodes, if it has low rank."""
     begin: Compilable
     """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""
     alive_word: int
@@ -148,7 +151,8 @@ class EpisodeKernel:
         actions = pack([action_keys_L], width)
         statistics = [x[..., self.inputs_O].reshape(-1, len(self.inputs_O)).astype(np.float32) for x in (mean_O, std_O)]
         constants = pack(statistics, width)
-        room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors, width))
+        ranks = self.low_rank.rank if self.low_rank else 0
+        room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors + ranks, width))
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
         if self.own_weights:
             require(len(statistics[0]) == len(weights) == lanes, "each lane must have weights and statistics")
@@ -160,8 +164,10 @@ class EpisodeKernel:
         if noise_keys_P is not None:
             pairs = width // 2
             keys = filled(noise_keys_P, blocks * pairs)
-            noise = aligned((self.network.block_bytes // 4,)).view(np.int8)
-        arrays = (carries, actions, constants, weights, keys, self.network.places, noise, room)
+            size = self.low_rank.block_bytes(width) if self.low_rank else self.network.block_bytes
+            noise = aligned((-(-size // 4),)).view(np.int8)
+        places = (self.low_rank or self.network).places
+        arrays = (carries, actions, constants, weights, keys, places, noise, room)
         require(
             [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
             and all(array.flags.c_contiguous for array in arrays),
@@ -214,6 +220,7 @@ def compile_episodes(
             spec=spec,
             inputs_O=inputs_O,
             network=program.network,
+            low_rank=program.low_rank,
             begin=begin,
             alive_word=program.alive_word,
             of_steps=program.of_steps,

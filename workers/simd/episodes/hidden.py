@@ -19,6 +19,7 @@ from es_service.protocol.policy_spec import Activation
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.layout import Layer, Network
+from workers.simd.episodes.noise import noise_of_weights
 from workers.simd.frontend.primitives.choices import extreme_of
 from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph
@@ -32,8 +33,18 @@ class View(NamedTuple):
     by_input: int
 
 
-def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
-    """Write out = f(centre x), for several members at a time."""
+def shared(
+    builder: FunctionBuilder,
+    layer: Layer,
+    x: View,
+    out: View,
+    begins: Callable[[str, str, Values], Values] = lambda first, tile, biases: biases,
+) -> None:
+    """Write out = f(centre x), for several members at a time.
+
+    Args:
+        begins: function (first member, tile, biases) -> with what the sums of these members begin.
+    """
     floats = builder.llvm_types["f"]
     members = min(builder.width, builder.target.sums_at_once // layer.tile)
     assert builder.width % members == 0
@@ -53,7 +64,8 @@ def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
                 found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
             return found
 
-        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, centre(layer.inputs) * members))
+        biases = first_sums(layer.bias, centre(layer.inputs) * members)
+        sums = builder.loop(layer.inputs, add, [(floats, one) for one in begins(first, number, biases)])
         for member in range(members):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -105,7 +117,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
             for pair, of_signs in enumerate(member_weights(layer.inputs, v)):
                 for sign, weight in enumerate(of_signs):
                     biases[(2 * pair + sign) * layer.tile + v] = weight
-        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, biases))
+        sums = builder.loop(layer.inputs, add, [(floats, one) for one in first_sums(layer.bias, biases)])
         for member in range(2 * pairs):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -176,7 +188,7 @@ def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
             return found
 
         biases = [vector for vectors in weights(layer.inputs) for vector in vectors]
-        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, biases))
+        sums = builder.loop(layer.inputs, add, [(floats, one) for one in first_sums(layer.bias, biases)])
         for member in range(members):
             _put(builder, wide, out, first, member, number, sums[member * wide.tile : (member + 1) * wide.tile])
         return []
@@ -202,13 +214,6 @@ def units(builder: FunctionBuilder) -> tuple[str, str]:
     return builder.splat("%unit"), builder.splat(builder.value("fadd float %unit, %unit"))
 
 
-def noise_of_weights(builder: FunctionBuilder, noise: str, vector: str) -> str:
-    """Vector of noise j, as floats, of a vector of weights."""
-    llvm_type = f"<{builder.width} x i8>"
-    words = builder.value(f"sext {llvm_type} {builder.load(llvm_type, noise, vector)} to {builder.llvm_types['i']}")
-    return builder.value(f"sitofp {builder.llvm_types['i']} {words} to {builder.llvm_types['f']}")
-
-
 def _seen(builder: FunctionBuilder, x: View, first: str, member: int, row: str) -> str:
     """Vector with a member's value of input `row` in all lanes."""
     index = builder.index((first, x.by_member), (member * x.by_member, 1), (row, x.by_input))
@@ -232,9 +237,9 @@ def _any_alive(builder: FunctionBuilder, first: str, members: int) -> str:
     )
 
 
-def first_sums(builder: FunctionBuilder, bias: bool, biases: Sequence[str]) -> list[tuple[str, str]]:
-    """(type, value) of the vectors with which sums begin: the biases, or 0."""
-    return [(builder.llvm_types["f"], one if bias else "zeroinitializer") for one in biases]
+def first_sums(bias: bool, biases: Values) -> Values:
+    """The vectors with which sums begin: the biases, or 0."""
+    return biases if bias else ["zeroinitializer"] * len(biases)
 
 
 def activated(builder: FunctionBuilder, activation: Activation, values: Sequence[str]) -> Values:

@@ -12,11 +12,14 @@ products, every output is one sum in the order of the inputs, starting with the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 from workers.simd.backend.function_builder import FunctionBuilder, Values
-from workers.simd.episodes.hidden import View, activated, first_sums, noise_of_weights, own, perturbed, shared, units
+from workers.simd.episodes.hidden import View, activated, first_sums, own, perturbed, shared, units
 from workers.simd.episodes.layout import Network
+from workers.simd.episodes.low_rank import LowRankNoise, begins_of_hidden, begins_of_last, by_sign, thin_sums
+from workers.simd.episodes.noise import noise_of_weights
 
 Weights = Literal["shared", "perturbed", "own"]
 """Where the weights of a member are from; see `hidden.py`."""
@@ -24,41 +27,58 @@ OUTPUTS_AT_ONCE = 4
 """Most outputs of the last layer that are computed in one loop over its inputs."""
 
 
-def policy_function(network: Network, weights: Weights) -> FunctionBuilder:
+def policy_function(network: Network, weights: Weights, low_rank: LowRankNoise | None = None) -> FunctionBuilder:
     """Function `void policy(ptr x, ptr alive, ..., ptr hidden, ptr action)`, with between them
 
-        shared      ptr centre
-        perturbed   ptr centre, ptr noise, float unit
-        own         ptr weights, ptr places, ptr singles
+        shared                          ptr centre
+        perturbed, or with low_rank     ptr centre, ptr noise, float unit
+        own                             ptr weights, ptr places, ptr singles
 
     x is [input, lane] and action [output, lane]. `alive` has a word for each lane; hidden layers are not computed for a
     group of neighbouring lanes that are all 0. centre is an array of `Network.pack`, noise one of
-    `noise.fill_function`, and hidden is memory for `network.hidden_vectors` vectors. weights has for each lane the
-    address of its parameters, in memory that goes on for at least a vector behind them; places is `Network.places`, and
-    singles an array of `singles_function`.
+    `noise.fill_function`, and hidden is memory for `network.hidden_vectors` vectors and one more for each rank. weights
+    has for each lane the address of its parameters, in memory that goes on for at least a vector behind them; places is
+    `Network.places`, and singles an array of `singles_function`.
+
+    Args:
+        low_rank: the noise of members that share the weights of the centre; None if they have none of this kind.
     """
     width = network.width
-    given = {"shared": ["centre"], "perturbed": ["centre", "noise"], "own": ["weights", "places", "singles"]}[weights]
-    parameters = [f"ptr noalias %{name}" for name in ("x", "alive", *given)]
-    parameters += ["float %unit"] if weights == "perturbed" else []
+    noisy = ["noise"] * (weights == "perturbed" or low_rank is not None)
+    given = ["weights", "places", "singles"] if weights == "own" else ["centre", *noisy]
+    parameters = [*(f"ptr noalias %{name}" for name in ("x", "alive", *given)), *["float %unit"] * len(noisy)]
     builder = FunctionBuilder("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], network.target)
-    buffers = [builder.at("%hidden", half * network.hidden_vectors // 2, builder.llvm_types["f"]) for half in range(2)]
+    buffers = [builder.at("%hidden", half * network.hidden_vectors // 2, builder.llvm_types["f"]) for half in range(3)]
+    *_, room_of_thin = buffers
     view = View("%x", 1, width)
     for number, layer in enumerate(network.hidden):
-        out = View(buffers[number % 2], layer.tiles * layer.tile * width, 1)
-        if weights == "shared":
+        out = View(buffers[0 if low_rank else number % 2], layer.tiles * layer.tile * width, 1)
+        if low_rank:
+            thin = thin_sums(builder, low_rank, number, layer.inputs, view.pointer)
+            for rank, value in enumerate(thin):
+                builder.store(builder.llvm_types["f"], value, room_of_thin, rank)
+            shared(builder, layer, view, out, begins_of_hidden(builder, low_rank, layer, number, room_of_thin))
+            _transpose(builder, out, layer.outputs, buffers[1])
+            out = View(buffers[1], 1, width)
+        elif weights == "shared":
             shared(builder, layer, view, out)
         elif weights == "perturbed":
             perturbed(builder, network, layer, view, out)
         else:
             own(builder, layer, view, out)
         view = out
-    seen = "%x"
-    if network.hidden:
+    seen = view.pointer
+    if network.hidden and not low_rank:
         seen = buffers[len(network.hidden) % 2]
         _transpose(builder, view, network.inputs, seen)
+
+    def begins(outputs: range, biases: Values) -> Values:
+        return begins_of_last(builder, low_rank, outputs, network.outputs, biases, thin) if low_rank else biases
+
+    thin = thin_sums(builder, low_rank, len(network.hidden), network.inputs, seen) if low_rank else []
     for first in range(0, network.outputs, OUTPUTS_AT_ONCE):
-        _last(builder, network, seen, range(first, min(first + OUTPUTS_AT_ONCE, network.outputs)), weights)
+        outputs = range(first, min(first + OUTPUTS_AT_ONCE, network.outputs))
+        _last(builder, network, seen, outputs, weights, begins)
     return builder
 
 
@@ -86,8 +106,19 @@ def singles_function(network: Network) -> FunctionBuilder:
     return builder
 
 
-def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, weights: Weights) -> None:
-    """Write action = f(weights x) for some outputs, with f = tanh or none; the lanes of a vector are members."""
+def _last(
+    builder: FunctionBuilder,
+    network: Network,
+    x: str,
+    outputs: range,
+    weights: Weights,
+    begins: Callable[[range, Values], Values],
+) -> None:
+    """Write action = f(weights x) for some outputs, with f = tanh or none; the lanes of a vector are members.
+
+    Args:
+        begins: function (outputs, their biases) -> with what their sums begin.
+    """
     floats, count = builder.llvm_types["f"], network.outputs
     singles = "" if weights == "own" else builder.at("%centre", network.vectors * builder.width, "float")
 
@@ -103,7 +134,7 @@ def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, we
     of_row = own_weights if weights == "own" else centre
     if weights == "perturbed":
         noise = builder.at("%noise", network.vectors * (builder.width // 2) * builder.width, "i8")
-        unit, twice = (_by_sign(builder, one) for one in units(builder))
+        unit, twice = (by_sign(builder, one) for one in units(builder))
 
         def of_row(row: str | int) -> Values:
             js = [noise_of_weights(builder, noise, builder.index((row, count), (output, 1))) for output in outputs]
@@ -114,7 +145,8 @@ def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, we
         seen = builder.load(floats, x, row)
         return [builder.fma(seen, weight, one) for weight, one in zip(of_row(row), sums, strict=True)]
 
-    sums = builder.loop(network.inputs, add, first_sums(builder, network.bias, of_row(network.inputs)))
+    biases = begins(outputs, first_sums(network.bias, of_row(network.inputs)))
+    sums = builder.loop(network.inputs, add, [(floats, one) for one in biases])
     sums = activated(builder, "tanh", sums) if network.output == "tanh" else sums
     for output, value in zip(outputs, sums, strict=True):
         builder.store(floats, value, "%action", output)
@@ -152,9 +184,3 @@ def _swapped(builder: FunctionBuilder, upper: str, lower: str, half: int) -> tup
         builder.value(f"shufflevector {floats} {upper}, {floats} {lower}, <{width} x i32> <{mask}>") for mask in masks
     )
     return first, second
-
-
-def _by_sign(builder: FunctionBuilder, value: str) -> str:
-    """Vector with the sign flipped in the lanes of - members."""
-    signs = ", ".join(f"float {-1.0 if lane % 2 else 1.0}" for lane in range(builder.width))
-    return builder.value(f"fmul {builder.llvm_types['f']} {value}, <{signs}>")

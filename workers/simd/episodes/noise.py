@@ -62,6 +62,13 @@ def lanes(builder: FunctionBuilder) -> str:
     return f"<{', '.join(f'i32 {lane}' for lane in range(builder.width))}>"
 
 
+def noise_of_weights(builder: FunctionBuilder, noise: str, vector: str | int) -> str:
+    """Vector of noise j, as floats, of a vector of weights."""
+    llvm_type = f"<{builder.width} x i8>"
+    words = builder.value(f"sext {llvm_type} {builder.load(llvm_type, noise, vector)} to {builder.llvm_types['i']}")
+    return builder.value(f"sitofp {builder.llvm_types['i']} {words} to {builder.llvm_types['f']}")
+
+
 def fill_function(vectors: int, singles: int, target: Target) -> FunctionBuilder:
     """Function `void fill(ptr keys, ptr places, ptr noise)`, which writes the bytes j of all pairs of a block.
 

@@ -27,6 +27,7 @@ from workers.simd.backend.target import Target
 from workers.simd.backend.words import words_of
 from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan
+from workers.simd.episodes.low_rank import LowRankNoise, plan_noise
 from workers.simd.episodes.network import Weights, policy_function, singles_function
 from workers.simd.episodes.noise import definition, fill_function
 from workers.simd.frontend.digest import jaxpr_digest
@@ -46,6 +47,8 @@ class EpisodeProgram(NamedTuple):
     alive_word: int
     """Index of the word of a carry that says whether the episode is alive."""
     network: Network
+    low_rank: LowRankNoise | None
+    """Layout of the noise of training episodes, if it has low rank."""
     of_steps: dict[str, range]
     """Words of a carry that have an output of each step, by its name."""
     name: str
@@ -70,9 +73,11 @@ def write_episodes(
     Raises:
         UnsupportedError: a step of the environment cannot be compiled. `text` of the result may raise it as well.
     """
-    weights: Weights = "perturbed" if training else "own" if own_weights else "shared"
+    rank = spec.noise_rank if training else 0
+    weights: Weights = "perturbed" if training and not rank else "own" if own_weights else "shared"
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, target)
+    low_rank = plan_noise(spec.policy, rank, inputs_O, network.hidden, target.width) if rank else None
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
     outputs = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
@@ -96,11 +101,12 @@ def write_episodes(
 
     def text() -> str:
         kept = [word for place in of_steps.values() for word in place]
-        return _module(*graphs(), network, len(inputs_O), words, alive_word, weights, kept)
+        return _module(*graphs(), network, low_rank, len(inputs_O), words, alive_word, weights, kept)
 
     digests = f"{definition()} {jaxpr_digest(normalised_observation)} {jaxpr_digest(advance)}"
-    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}{' own' * own_weights}"
-    return EpisodeProgram(steps, carry, alive_word, network, of_steps, name, text, graphs)
+    kind = f"{training}{' own' * own_weights}{f' rank {rank}' if rank else ''}"
+    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {kind}"
+    return EpisodeProgram(steps, carry, alive_word, network, low_rank, of_steps, name, text, graphs)
 
 
 def _places(carry: Carry) -> Any:
@@ -114,6 +120,7 @@ def _module(
     normalised_observation: Traced,
     advance: Traced,
     network: Network,
+    low_rank: LowRankNoise | None,
     inputs: int,
     words: int,
     alive_word: int,
@@ -139,11 +146,14 @@ def _module(
     graph, _, outputs = advance
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
     advance_code = graph_function("move", graph, outputs, sources, "carry", target)
-    policy_code = policy_function(network, weights)
-    fill_code = fill_function(network.vectors, len(network.places) - network.vectors, target)
-    keep_code = [keep_function(network)] * network.keeps_weights
-    before = {"perturbed": [fill_code, *keep_code], "own": [singles_function(network)], "shared": []}[weights]
-    own, noisy = weights == "own", weights == "perturbed"
+    policy_code = policy_function(network, weights, low_rank)
+    own, noisy, keeps = weights == "own", weights == "perturbed" or low_rank is not None, False
+    before = [singles_function(network)] if own else []
+    if noisy:
+        layout = low_rank or network
+        before.append(fill_function(layout.vectors, len(layout.places) - layout.vectors, target))
+        if keeps := low_rank is None and network.keeps_weights:
+            before.append(keep_function(network))
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room", "kept"]
     builder = FunctionBuilder(
@@ -165,7 +175,7 @@ def _module(
         if noisy:
             keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")
             builder.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
-            if network.keeps_weights:
+            if keeps:
                 builder.do("call void @keep(ptr %centre, ptr %noise, float %unit)")
 
         def keep(number_of_step: str) -> None:
