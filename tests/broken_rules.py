@@ -173,7 +173,10 @@ EPISODE, WORKER, RESULTS, POLICY = (
 )
 XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
-NETWORK = "workers/simd/episodes/network.py"
+LOW_RANK = "es_service/protocol/low_rank.py"
+LOW_RANK_OF_KERNELS = "workers/simd/episodes/low_rank.py"
+LOW_RANK_OF_XLA = "workers/policies/low_rank.py"
+NOISE_OF_KERNELS = "workers/simd/episodes/noise.py"
 
 OF_NOVELTY, OF_NOVELTY_SEARCH = "tests/es_service/test_novelty.py", "tests/laws/test_novelty_search.py"
 OF_ME_ES, OF_RULES = "tests/laws/test_me_es.py", "tests/laws/test_update_rules.py"
@@ -386,7 +389,26 @@ CASES = [
             """(plus, builder.value(f"fsub {floats} {doubled}, {plus}")) for""",
             """(builder.value(f"fsub {floats} {doubled}, {plus}"), plus) for""",
         ),
-        ("in a member's last layer, simd", NETWORK, "-1.0 if lane % 2 else 1.0", "1.0 if lane % 2 else -1.0"),
+        ("in a member's last layer, simd", NOISE_OF_KERNELS, "-1.0 if lane % 2 else 1.0", "1.0 if lane % 2 else -1.0"),
+    ),
+    *cases(
+        "noise of low rank",
+        "tests/workers/test_low_rank.py",
+        ("is not divided by the root of its rank", LOW_RANK, "NORMAL_STD * math.sqrt(rank)", "NORMAL_STD"),
+        ("uses the numbers of A for B", LOW_RANK, "drawn[..., right]", "drawn[..., right - right.min()]"),
+        ("of both members has one sign, xla", LOW_RANK_OF_XLA, "unit * SIGNS_S", "unit * SIGNS_S**2"),
+        (
+            "forgets the sign of a member's biases, simd",
+            LOW_RANK_OF_KERNELS,
+            'builder.value("fneg float %unit")',
+            '"%unit"',
+        ),
+        (
+            "of a gradient takes another input's number, simd",
+            "workers/simd/episodes/low_rank_gradient.py",
+            "(left, 1), (at_left, 1), (i, 1)",
+            "(left, 1), (at_left, 1), (j, 1)",
+        ),
     ),
     *cases(
         "the tree of sums",

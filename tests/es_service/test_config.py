@@ -162,6 +162,9 @@ def test_simd_is_what_auto_chooses_where_it_can_be_had():
     elites = load(MINIMAL | {"search": {"algorithm": "map_elites"}}, "compute.worker_resources.gpu=1")
     (warning,) = config_warnings(elites, POINT_MAZE, BACKENDS)
     assert warning.startswith("compute.worker_resources.gpu: map_elites has no training episodes")
+    low_rank = load(MINIMAL, "compute.worker_resources.gpu=1", "search.noise.kind=low_rank")
+    (warning,) = config_warnings(low_rank, POINT_MAZE, BACKENDS)
+    assert warning.startswith("compute.worker_resources.gpu: search.noise.kind = low_rank is not for training episodes")
     no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive sort"})
     here = {"point_maze": no_simd}
     config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)

@@ -253,6 +253,11 @@ def test_a_seed_belongs_to_the_episode_and_both_of_a_pair_share_it():
     np.testing.assert_allclose(found.fitness, -4.0 + 2.0 * np.array(noise), rtol=1e-6)
 
 
+def test_noise_of_low_rank_is_refused():
+    with pytest.raises(ConfigError, match=r"search.noise.kind: low_rank is not allowed.*no matrices.*must be full"):
+        load_config(config_of(HILL), ["search.noise.kind=low_rank"])
+
+
 def test_a_policy_is_refused_and_a_resolved_config_is_not(tmp_path):
     config = load_config(config_of(HILL))
     assert load_config(yaml.safe_load(config.resolved_yaml())) == config

@@ -20,7 +20,7 @@ from es_service.protocol.low_rank import layers_of_noise, product_unit
 from es_service.protocol.policy_spec import PolicySpec
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.layout import Layer
-from workers.simd.episodes.noise import float_constant, noise_of_weights
+from workers.simd.episodes.noise import by_sign, float_constant, noise_of_weights
 
 
 class LowRankNoise(NamedTuple):
@@ -148,12 +148,6 @@ def begins_of_last(
         rows = [noise.right + row * count + output for row in range(noise.rank + noise.bias)]
         found.append(_moved(builder, noise, bias, [_integer(builder, singles, row) for row in rows], unit, thin))
     return found
-
-
-def by_sign(builder: FunctionBuilder, value: str) -> str:
-    """Vector with the sign flipped in the lanes of - members."""
-    signs = ", ".join(f"float {-1.0 if lane % 2 else 1.0}" for lane in range(builder.width))
-    return builder.value(f"fmul {builder.llvm_types['f']} {value}, <{signs}>")
 
 
 def _moved(builder: FunctionBuilder, noise: LowRankNoise, value: str, rows: Values, unit: str, factors: Values) -> str:

@@ -18,8 +18,8 @@ from typing import Literal
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.hidden import View, activated, first_sums, own, perturbed, shared, units
 from workers.simd.episodes.layout import Network
-from workers.simd.episodes.low_rank import LowRankNoise, begins_of_hidden, begins_of_last, by_sign, thin_sums
-from workers.simd.episodes.noise import noise_of_weights
+from workers.simd.episodes.low_rank import LowRankNoise, begins_of_hidden, begins_of_last, thin_sums
+from workers.simd.episodes.noise import by_sign, noise_of_weights
 
 Weights = Literal["shared", "perturbed", "own"]
 """Where the weights of a member are from; see `hidden.py`."""

@@ -69,6 +69,12 @@ def noise_of_weights(builder: FunctionBuilder, noise: str, vector: str | int) ->
     return builder.value(f"sitofp {builder.llvm_types['i']} {words} to {builder.llvm_types['f']}")
 
 
+def by_sign(builder: FunctionBuilder, value: str) -> str:
+    """Vector with the sign flipped in the lanes of - members."""
+    signs = ", ".join(f"float {-1.0 if lane % 2 else 1.0}" for lane in range(builder.width))
+    return builder.value(f"fmul {builder.llvm_types['f']} {value}, <{signs}>")
+
+
 def fill_function(vectors: int, singles: int, target: Target) -> FunctionBuilder:
     """Function `void fill(ptr keys, ptr places, ptr noise)`, which writes the bytes j of all pairs of a block.
 
