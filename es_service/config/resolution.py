@@ -332,12 +332,11 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
     ]
     search = config.search
     if config.compute.worker_resources.gpu and rollouts[chosen].gpus_only_train:
-        only = f"training episodes, which are all that {chosen} computes on a GPU"
+        only = f"{chosen} computes only training episodes there"
         if not isinstance(search, PopulationConfig):
-            warnings.append(f"{RESOURCES}gpu: {search.algorithm} has no {only}; the rest is computed on the CPU")
+            warnings.append(f"{RESOURCES}gpu: no GPU is used: {only}, and {search.algorithm} has none")
         elif search.noise.kind != "full":
-            without = f"search.noise.kind = {search.noise.kind} is not for {only}; all is computed on the CPU"
-            warnings.append(f"{RESOURCES}gpu: {without}")
+            warnings.append(f"{RESOURCES}gpu: no GPU is used: {only}, and only those with search.noise.kind = full")
     pairs = search.pairs if isinstance(search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
     if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].pair_limits(task)[0]) and pairs > MOST_CHUNK_PAIRS:

@@ -161,10 +161,10 @@ def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "simd"
     elites = load(MINIMAL | {"search": {"algorithm": "map_elites"}}, "compute.worker_resources.gpu=1")
     (warning,) = config_warnings(elites, POINT_MAZE, BACKENDS)
-    assert warning.startswith("compute.worker_resources.gpu: map_elites has no training episodes")
+    assert warning.endswith("simd computes only training episodes there, and map_elites has none")
     low_rank = load(MINIMAL, "compute.worker_resources.gpu=1", "search.noise.kind=low_rank")
     (warning,) = config_warnings(low_rank, POINT_MAZE, BACKENDS)
-    assert warning.startswith("compute.worker_resources.gpu: search.noise.kind = low_rank is not for training episodes")
+    assert warning.endswith("and only those with search.noise.kind = full")
     no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive sort"})
     here = {"point_maze": no_simd}
     config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
