@@ -99,6 +99,14 @@ nas:/export on /Volumes/nfs (nfs)
 """
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says it of a process alone")
+def test_the_memory_of_a_process_is_not_that_of_the_one_that_started_it() -> None:
+    large = bytearray(os.urandom(1 << 20) * 300)
+    code = "from es_service.protocol.system import peak_memory_mib; print(peak_memory_mib())"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert 5 < int(printed) < len(large) >> 20 <= system.peak_memory_mib()
+
+
 def test_mounts_of_macos(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("es_service.store.folder.mounts", lambda: system.mounts_of_macos(MACOS))
     assert [kind for _, kind in system.mounts_of_macos(MACOS)] == ["apfs", "apfs", "autofs", "smbfs", "nfs"]
