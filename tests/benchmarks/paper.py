@@ -20,11 +20,11 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import pandas as pd
 
@@ -62,6 +62,19 @@ class Wanted(NamedTuple):
     def name(self) -> str:
         """Of its folder."""
         return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
+
+
+class NamedRun(Protocol):
+    """A run that is wanted."""
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        ...
+
+
+WantedRun = TypeVar("WantedRun", bound=NamedRun)
+Result = TypeVar("Result")
 
 
 class Computed(NamedTuple):
@@ -140,13 +153,18 @@ def missing(wanted: list[Wanted], table: pd.DataFrame, curves: pd.DataFrame) -> 
     return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
 
 
-def compute(wanted: list[Wanted], keep: Callable[[Computed], None]) -> None:
-    """Compute runs, one per core at a time, and `keep` what is kept of each as soon as it is there."""
-    RUNS.mkdir(parents=True, exist_ok=True)
+def compute(
+    wanted: Sequence[WantedRun], run: Callable[[WantedRun], Result], keep: Callable[[Result], bool], folder: Path
+) -> None:
+    """Compute runs in `folder`, one per core at a time, and `keep` what is kept of each as soon as it is there.
+
+    `run` gives that, and `keep` says whether the run is finished, so that its folder can go.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     cleaned = worker_environment(os.environ)
     os.environ.clear()
     os.environ.update(cleaned)  # the processes below import JAX with it
-    left, running, stopped = list(wanted), dict[Future, Wanted](), False
+    left, running, stopped = list(wanted), dict[Future, WantedRun](), False
 
     def stop(*_: object) -> None:
         nonlocal stopped
@@ -157,29 +175,30 @@ def compute(wanted: list[Wanted], keep: Callable[[Computed], None]) -> None:
         while running or (left and not stopped):
             while left and not stopped and len(running) < cores():  # the pool gets no run that would have to wait
                 one = left.pop(0)
-                running[pool.submit(run_one, one)] = one
+                running[pool.submit(run, one)] = one
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 one = running.pop(future)
                 if isinstance(future.exception(), Interrupted):
                     continue
-                computed = future.result()
-                print(json.dumps(computed.row), flush=True)
-                keep(computed)
-                if computed.row["finished"]:
-                    shutil.rmtree(RUNS / one.name)
+                if keep(future.result()):
+                    shutil.rmtree(folder / one.name)
 
 
-def keep_run(run: Computed) -> None:
+def keep_run(run: Computed) -> bool:
     """Put a run's curve and its row into the csv files, in the place of older ones, and write the tables."""
+    print(json.dumps(run.row), flush=True)
     of_run = {key: run.row[key] for key in paper_tables.RUN}
     paper_tables.write_curves(paper_tables.with_run(paper_tables.read_curves(), of_run, run.curve.assign(**of_run)))
     paper_tables.write(paper_tables.with_run(paper_tables.read(), of_run, pd.DataFrame([run.row])))
+    return run.row["finished"]
 
 
-def keep_trial(run: Computed) -> None:
+def keep_trial(run: Computed) -> bool:
     """Add the row of a trial to their table, whose first rows have other columns."""
+    print(json.dumps(run.row), flush=True)
     before = [pd.read_csv(TRIALS)] if TRIALS.exists() else []
     pd.concat([*before, pd.DataFrame([run.row])]).to_csv(TRIALS, index=False, lineterminator="\n")
+    return run.row["finished"]
 
 
 def main() -> None:
@@ -196,7 +215,9 @@ def main() -> None:
         if seeds is None or arguments.env_steps is None:
             parser.error("--config needs --seeds and --env-steps")
         settings = tuple(arguments.set)
-        compute([Wanted(arguments.config, seed, arguments.env_steps, settings) for seed in seeds], keep_trial)
+        compute(
+            [Wanted(arguments.config, seed, arguments.env_steps, settings) for seed in seeds], run_one, keep_trial, RUNS
+        )
         return
     if arguments.set:
         parser.error("--set needs --config")
@@ -207,7 +228,7 @@ def main() -> None:
         for config in [CONFIGS / f"{task}_{method}.yaml"]
         for seed in seeds or seeds_of_table(task, method)
     ]
-    compute(missing(wanted, paper_tables.read(), paper_tables.read_curves()), keep_run)
+    compute(missing(wanted, paper_tables.read(), paper_tables.read_curves()), run_one, keep_run, RUNS)
     paper_tables.write(paper_tables.read())
     paper_picture.draw(paper_tables.read_curves(), PICTURE)
 

@@ -1,0 +1,168 @@
+"""What each method finds on the three tasks, in episodes that no choice has seen.
+
+    python -m tests.benchmarks.certified                                   # all that is missing: hours on two cores
+    python -m tests.benchmarks.certified --task ant_trap --method nsr_es me_es --seeds 0:2
+    python -m tests.benchmarks.certified --table                           # only print the tables
+    python -m tests.benchmarks.certified --config my.yaml --seeds 100:101 --marks 30_000_000 --set search.sigma=0.05
+
+Configs are those of configs/certified, and the shipped ones of MEMES and MAP-Elites. A run stops at each mark, a number
+of environment steps, its best centre and ten fittest elites are certified, and it goes on. There are as many runs at a
+time as cores, each in one process; each gives a row for each mark in results/certified_methods.csv, and is not computed
+again. One that is interrupted goes on from its folder in runs/certified_methods. The last form is a trial, whose rows
+are printed and added to results/certified_trials.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+
+from es_service import api
+from es_service.cli.sweep import seeds_of
+from es_service.protocol.machine import cpu_kind
+from es_service.runs.certification import certify_run
+from es_service.runs.certified import certified_policies
+from tests.benchmarks.paper import commit, compute
+from tests.helpers import workers_in_this_process
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs"
+RUNS = ROOT / "runs" / "certified_methods"
+RESULTS = Path(__file__).parent / "results" / "certified_methods.csv"
+TRIALS = RESULTS.with_name("certified_trials.csv")
+TASKS = ("point_maze", "ant_maze", "ant_trap")
+SHIPPED = ("memes", "map_elites")
+METHODS = ("es", "ns_es", "nsr_es", "nsra_es", "me_es", *SHIPPED, "ars")
+MARKS = (1_000_000, 10_000_000, 100_000_000)
+RUN = ["task", "method", "settings", "seed"]
+SHOWN = {"point_maze": "return_mean", "ant_maze": "successes", "ant_trap": "return_mean"}
+
+
+class Wanted(NamedTuple):
+    """A run that is to be certified at each mark."""
+
+    config: Path
+    seed: int
+    marks: tuple[int, ...]
+    settings: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
+
+
+def run_one(wanted: Wanted) -> pd.DataFrame:
+    """One run from its config, or from where it was interrupted: a row for each mark."""
+    code, folder = commit(), RUNS / wanted.name
+    with workers_in_this_process():
+        for number, mark in enumerate(wanted.marks):
+            limits = ("env_steps", mark), ("generations", "null"), ("target_certified", "null")
+            budget = (f"budget.{name}={value}" for name, value in limits)
+            fixed = ("compute.engine=inline", "compute.workers=1", f"seed={wanted.seed}")
+            api.run_or_resume(api.load_config(wanted.config, (*fixed, *budget, *wanted.settings)), folder)
+            if number > max((one.number for one in certified_policies(folder)), default=-1):
+                certify_run(folder, workers=1)
+    run = api.open_run(folder)
+    rows = []
+    for one in certified_policies(folder):
+        then = run.history[run.history.env_steps >= wanted.marks[one.number]].iloc[0]
+        of_run = {
+            "task": run.config["task"]["environment"],
+            "method": run.config["search"]["algorithm"],
+            "settings": " ".join([wanted.config.stem, *wanted.settings]),
+            "seed": wanted.seed,
+            "env_steps": int(then.env_steps),
+            "seconds": round(float(then.wall_clock_s)),
+        }
+        rows.append(of_run | one.row() | {"cpu": cpu_kind(), "commit": code})
+    return pd.DataFrame(rows)
+
+
+def read(path: Path) -> pd.DataFrame:
+    """A table of results, without rows if there is no file."""
+    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=[*RUN, "env_steps"])
+
+
+def keep(path: Path, rows: pd.DataFrame) -> bool:
+    """Put the rows of a finished run into a table, in the place of older ones of it."""
+    table = read(path)
+    others = table[~(table[RUN] == rows[RUN].iloc[0]).all(axis="columns")]
+    kept = [part for part in (others, rows) if len(part)]
+    pd.concat(kept).sort_values([*RUN, "env_steps"]).to_csv(path, index=False, lineterminator="\n")
+    print(rows[[*RUN, "env_steps", "seconds", "return_mean", "successes"]].to_string(header=False), flush=True)
+    return True
+
+
+def config_of(task: str, method: str) -> Path:
+    """The config of a method in the tables."""
+    return (CONFIGS if method in SHIPPED else CONFIGS / "certified") / f"{task}_{method}.yaml"
+
+
+def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
+    """Those that have no row at their last mark."""
+    known = {(row.settings, row.seed): row.env_steps for row in table.itertuples()}
+    return [
+        one for one in wanted if known.get((" ".join([one.config.stem, *one.settings]), one.seed), 0) < one.marks[-1]
+    ]
+
+
+def in_words(table: pd.DataFrame) -> str:
+    """A table for each task, in Markdown: the median over the seeds at each mark, and then each seed's last value."""
+    parts = []
+    for task, column in SHOWN.items():
+        of_task = table[table.task == task]
+        what = "episodes of 256 that end at the goal" if column == "successes" else "certified return"
+        columns = [f"{mark:.0e}".replace("e+0", "e") for mark in MARKS]
+        parts += [
+            f"\n**{task}: {what}**\n",
+            f"| method | {' | '.join(columns)} | each seed |",
+            "| --- |" + " --- |" * 4,
+        ]
+        for method in METHODS:
+            of_method = of_task[of_task.method == method]
+            if of_method.empty:
+                continue
+            cells = []
+            for mark in MARKS:
+                at_mark = of_method[of_method.env_steps >= mark].groupby("seed")[column].first()
+                cells.append(_number(at_mark.median()) if len(at_mark) else "")
+                last = at_mark if len(at_mark) else None
+            seeds = "" if last is None else ", ".join(_number(value) for value in last)
+            parts.append(f"| {method} | {' | '.join(cells)} | {seeds} |")
+    return "\n".join(parts)
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.1f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--seeds", metavar="A:B", default="0:5")
+    parser.add_argument("--marks", nargs="+", type=lambda text: int(float(text.replace("_", ""))), default=MARKS)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--config", type=Path, help="a trial: a config of your own")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of a trial")
+    given = parser.parse_args()
+    path, trial = (TRIALS, True) if given.config else (RESULTS, False)
+    if given.set and not trial:
+        parser.error("--set needs --config")
+    configs = [given.config] if trial else [config_of(task, method) for task in given.task for method in given.method]
+    wanted = [
+        Wanted(config, seed, tuple(given.marks), tuple(given.set))
+        for seed in seeds_of(given.seeds)
+        for config in configs
+    ]
+    if not given.table:
+        compute(missing(wanted, read(path)), run_one, lambda rows: keep(path, rows), RUNS)
+    print(in_words(read(path)))
+
+
+if __name__ == "__main__":
+    main()
