@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import pickle
 import socket
+from threading import Lock
 from typing import TYPE_CHECKING
 
 from es_service.protocol.kept_parents import LackingError
@@ -24,7 +25,8 @@ if TYPE_CHECKING:  # they import JAX, whose settings are made here
 
 
 class WorkerActor:
-    """One worker of a run. Its methods are called one at a time, in the order of the requests."""
+    """One worker of a run. Its methods are called in the order of the requests, one at a time or two side by side: then
+    cores that have nothing left to do of one work item begin the next one."""
 
     def __init__(self, spec: bytes, index: int, gpus: float = 0.0, cores: int = 1) -> None:
         """Keep the arguments; `build` makes the worker.
@@ -39,6 +41,8 @@ class WorkerActor:
         self._environment = ""
         self._run_chunks: Compilable | None = None
         self._parents: Parents | None = None
+        self._turn = Lock()
+        """Held while it compiles, and while it keeps the parents of policies that came with a call."""
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -80,7 +84,7 @@ class WorkerActor:
         The engine calls this before the first call of `run` for each kind of chunk.
         """
         assert self._run_chunks is not None, "compile was called before build"
-        with sendable(self._environment):
+        with self._turn, sendable(self._environment):
             return self._run_chunks.seconds_to_compile(self._unpacked(chunks, parts))
 
     def run(self, chunks: bytes, *parts: bytes) -> bytes:
@@ -93,7 +97,8 @@ class WorkerActor:
         assert self._run_chunks is not None, "run was called before build"
         with sendable(self._environment):
             try:
-                work = self._unpacked(chunks, parts)
+                with self._turn:
+                    work = self._unpacked(chunks, parts)
             except LackingError:
                 return pickle.dumps(None)
             return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)

@@ -2,7 +2,9 @@
 
 Idle workers are served first, those that answered their last item in time before others, then workers that can take
 another item behind the one they run. A work item that failed on a worker is not assigned to that worker again while
-another worker is up: otherwise a broken worker that fails at once would use up the attempts of good items.
+another worker is up: otherwise a broken worker that fails at once would use up the attempts of good items. If workers
+begin an item before they have finished another, none is assigned behind another one from a loss until the next result:
+the next loss, if it is the cause, would be charged to the other one again.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from es_service.dispatch.scheduler_state import SchedulerState, Slot, Waiting
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> None:
     """Assign queued items to workers that can take more, idle workers first."""
-    for load in range(s.limits.in_flight):
+    for load in range(1 if s.limits.items_overlap and s.losses_in_a_row else s.limits.in_flight):
         passed = 0
         while s.places and passed < len(s.free):
             slots, _, _, worker = s.free[passed]

@@ -33,6 +33,8 @@ class Limits:
     """Cores of each worker. A work item has at least one chunk for each, as far as there are enough chunks."""
     in_flight: int = 2
     """Work items assigned to one worker at a time: the one that it runs, and those that wait behind it."""
+    items_overlap: bool = False
+    """Whether a worker with several cores begins the next item as soon as one of them has nothing left to do."""
     item_s: float = 0.03
     """Time that a work item should take. Shorter chunks are sent together, because with Ray a message costs two
     milliseconds of a core. It is short, so that little work is lost with a worker or waited for at the end."""

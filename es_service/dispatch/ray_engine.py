@@ -75,7 +75,8 @@ def ray_engine(
     try:
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, grows=grows, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal)
+        at_once = limits.in_flight if limits.items_overlap and claim.cpus > 1 else 1
+        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, at_once)
         on_wait = (lambda shortage: None) if watch is None else on_wait
         return Engine(transport, limits, should_stop, log, on_wait, on_compile)
     except BaseException:
@@ -96,6 +97,7 @@ class Actors:
         growth: Growth | None,
         workers: int,
         on_refusal: Callable[[str], None] = lambda refusal: None,
+        items_at_once: int = 1,
     ) -> None:
         """Make a transport without workers.
 
@@ -104,11 +106,12 @@ class Actors:
             growth: when the room for workers changes, `SetWorkers` follows it; None: no `SetWorkers`.
             workers: number of workers wanted at the start.
             on_refusal: called once for each host whose code is not the driver's, with what its worker said.
+            items_at_once: number of calls that an actor answers side by side, each in a thread.
         """
         self._ray = ray
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
         options = {"num_cpus": claim.cpus, "num_gpus": claim.gpus, "max_restarts": 0, "max_task_retries": 0}
-        self._class = ray.remote(**options)(actor)
+        self._class = ray.remote(**options, max_concurrency=items_at_once)(actor)
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls, self._arguments = Calls(ray), Arguments(ray)

@@ -225,6 +225,7 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         chunk_timeout_s=compute.chunk_timeout_s,
         place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
+        items_overlap=not rollout.runs_in_threads,
         late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
         time_limit_s=chunk_limit_s(config, task),
         episodes_together=rollout.episodes_together(task),

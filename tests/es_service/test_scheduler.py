@@ -67,6 +67,22 @@ def test_what_a_bystander_was_computing_is_not_to_blame():
     assert state.lost_workers == 5
 
 
+def test_where_items_overlap_the_one_that_loses_workers_is_named_and_not_the_one_before_it():
+    """One worker, which begins `p` while it still computes `a`: `p` ends its process each time."""
+    state, _ = play(ready(1, items_overlap=True), (1.0, items("apz")), (2.0, WorkerLost(0, "killed")))
+    state, commands = play(state, (3.0, WorkerUp(1)))
+    assert commands == [Assign(1, "a", 2)], "`p` waits, or it would be the loss of `a` again"
+    state, commands = step(state, Result(1, "a", 2), 4.0)
+    assert commands == [Deliver("a"), Assign(1, "p", 1), Assign(1, "z", 1)]
+    for worker, attempt in ((1, 2), (2, 3)):
+        now = 10.0 * worker
+        state, _ = play(state, (now, WorkerLost(worker, "killed")), (now + 5.0, Tick()))
+        state, commands = play(state, (now + 6.0, WorkerUp(worker + 1)))
+        assert commands == [Assign(worker + 1, "p", attempt)]
+    state, _ = play(state, (30.0, WorkerLost(3, "killed")))
+    assert "work item p failed in 3 attempts" in state.failed
+
+
 def test_a_task_that_raised_waits_for_another_worker():
     state, commands = play(ready(in_flight=1), (1.0, items("abcd")), (2.0, Failure(0, "a", 1, "no")))
     assert commands == [Assign(0, "c", 1)]

@@ -7,10 +7,11 @@ import signal
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
-from es_service import api
+from es_service import api, evaluator
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.helpers import workers_in_this_process
@@ -72,6 +73,24 @@ def test_workers_of_ray_have_the_bits_of_this_process(workers, tmp_path, referen
     run = api.run(api.load_config(config), tmp_path / "run", on_notice=pytest.fail).run
     assert run.history.workers.iloc[-1] == workers
     assert digest_parts(run.folder) == reference
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_core_of_an_actor_begins_the_next_work_item_while_the_other_one_computes(tmp_path, monkeypatch):
+    """The first two calls are one work item: one waits for a call of the second item, and the other one is done."""
+    monkeypatch.setenv("PATIENT_FOLDER", str(tmp_path))
+    config = {
+        "task": {"environment": "function:tests.workers.functions:patient"},
+        "search": {"algorithm": "map_elites", "batch": 4},
+        "map": {"bounds": [[-1, 1]]},
+        "budget": {"generations": 1},
+        "compute": {"engine": "ray", "workers": 2, "worker_resources": {"cpu": 2}},
+    }
+    with evaluator(config) as evaluate:
+        fitness_N_E = evaluate(np.float32([[1.0], [0.0], [-1.0], [0.0]]), episodes=1, seed=0, generation=1).fitness
+    np.testing.assert_array_equal(fitness_N_E[:, 0], [1.0, 0.0, -1.0, 0.0])
 
 
 FAULTS = {

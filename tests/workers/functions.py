@@ -91,3 +91,22 @@ def slow(parameters):
 
 
 slow.parameters = 3
+
+
+def patient(parameters):
+    """A call with a positive parameter waits for one with a negative one, which is in another work item."""
+    place = Path(os.environ["PATIENT_FOLDER"])
+    if parameters[0] < 0.0:
+        (place / "met").touch()
+    elif parameters[0] > 0.0:
+        (place / "begun").touch()
+        until = time.monotonic() + 60.0
+        while not (place / "met").exists():
+            if time.monotonic() > until:
+                raise TimeoutError("the other work item has not begun")
+            time.sleep(0.01)
+    return float(parameters.sum())
+
+
+patient.parameters = 1
+patient.deterministic = True

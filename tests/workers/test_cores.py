@@ -73,9 +73,45 @@ if __name__ == "__main__":
 """
 
 
-def child_program(tmp_path, *arguments):
+TWO_ITEMS = """
+import pickle, sys, time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+if __name__ == "__main__":
+    import numpy as np
+    from es_service.protocol.messages import EvaluationChunk, PolicySpec
+    from tests.helpers import centre, spec
+    from workers.actor import WorkerActor
+
+    given = spec(environment="function:tests.workers.functions:patient", rollout="host", episode_steps=1,
+                 policy=PolicySpec((0, 1), bias=True), chunk_pairs=1)
+    actor = WorkerActor(pickle.dumps(given), 0, cores=2)
+    actor.build()
+
+    def item(value):
+        subject = centre(np.full(1, value), observation_size=0)
+        return pickle.dumps([(0, EvaluationChunk(1, 0))]), pickle.dumps(subject)
+
+    with ThreadPoolExecutor(2) as calls:
+        first = calls.submit(actor.run, *item(1.0))
+        while not Path(sys.argv[1], "begun").exists():
+            time.sleep(0.01)
+        second = calls.submit(actor.run, *item(-1.0))
+        fitness = [pickle.loads(call.result())[0].fitness for call in (first, second)]
+    assert np.array_equal(fitness, np.full_like(fitness, 1.0) * [[1.0], [-1.0]]), fitness
+"""
+
+
+def test_a_core_that_has_nothing_left_to_do_begins_the_next_work_item(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATIENT_FOLDER", str(tmp_path))
+    done = child_program(tmp_path, str(tmp_path), program=TWO_ITEMS)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+def child_program(tmp_path, *arguments, program=PROGRAM):
     file = tmp_path / "program.py"
-    file.write_text(textwrap.dedent(PROGRAM))
+    file.write_text(textwrap.dedent(program))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run([sys.executable, file, *arguments], env=environment, capture_output=True, timeout=120)
 
