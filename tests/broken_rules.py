@@ -227,10 +227,11 @@ CASES = [
             "np.zeros((1, dimensions)), np.zeros(1, np.int64), np.zeros(1, np.int64)",
         ),
         (
-            "zeros as spare capacity",
+            "a row of spare capacity",
             NOVELTY,
             "return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.centre[: room.used], tree, room)",
-            "return NoveltyArchive(room.descriptor_B * 1.0, room.generation, room.centre, tree, room)",
+            "n = room.used + 1\n    "
+            "return NoveltyArchive(room.descriptor_B[:n] * 1.0, room.generation[:n], room.centre[:n], tree, room)",
         ),
     ),
     *cases(
