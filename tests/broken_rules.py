@@ -359,6 +359,16 @@ CASES = [
         ),
     ),
     *cases(
+        "the item that loses workers is charged where items overlap",
+        "tests/es_service/test_scheduler.py",
+        (
+            "an item is behind another one after a loss",
+            "es_service/dispatch/assignment.py",
+            "1 if s.limits.items_overlap and s.losses_in_a_row else s.limits.in_flight",
+            "s.limits.in_flight",
+        ),
+    ),
+    *cases(
         "the order of arrival",
         "tests/es_service/test_engine.py",
         (
