@@ -217,6 +217,19 @@ def test_of_a_parent_that_was_made_of_others_only_the_origin_travels(most):
     assert max(origins) > 0
 
 
+def test_parents_that_a_worker_lacks_are_made_after_what_they_are_made_of():
+    """It has the first two. Of their children and grandchildren it hears with the first item of these."""
+    parents = list(np.random.default_rng(0).normal(size=(2, 2000)).astype(np.float32))
+    worker = Worker(1000)
+    for generation in range(3):
+        asked = recipes(4, generation, parents=parents)
+        work = policy_work(asked, no_statistics(4, 2), 1, seed=0, generation=generation)
+        if generation != 1:
+            assert made(worker.item(work.work)) == made(work.work)
+        parents = [work.policy(number).parameters_D for number in range(2)]
+    assert [isinstance(given, Origin) for given in worker.received] == [False] * 2 + [True] * 4
+
+
 def test_a_small_parent_travels_itself():
     worker = Worker(1000)
     for work in descendants(10, LEAST_BYTES // 4 - 1):
