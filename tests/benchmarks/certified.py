@@ -38,7 +38,23 @@ SHIPPED = ("memes", "map_elites")
 METHODS = ("es", "ns_es", "nsr_es", "nsra_es", "me_es", *SHIPPED, "ars")
 MARKS = (1_000_000, 10_000_000, 100_000_000)
 RUN = ["task", "method", "settings", "seed"]
-SHOWN = {"point_maze": "return_mean", "ant_maze": "successes", "ant_trap": "return_mean"}
+SEEDS = 5
+
+
+class Shown(NamedTuple):
+    """Columns of a task in the printed table."""
+
+    task: str
+    title: str
+    column: str
+    marks: tuple[int, ...]
+
+
+SHOWN = (
+    Shown("point_maze", "PointMaze: return", "return_mean", MARKS),
+    Shown("ant_maze", "AntMaze: episodes of 256 at the goal", "successes", MARKS[1:]),
+    Shown("ant_trap", "AntTrap: return", "return_mean", MARKS[1:]),
+)
 
 
 class Wanted(NamedTuple):
@@ -111,29 +127,30 @@ def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
 
 
 def in_words(table: pd.DataFrame) -> str:
-    """A table for each task, in Markdown: the median over the seeds at each mark, and then each seed's last value."""
-    parts = []
-    for task, column in SHOWN.items():
-        of_task = table[table.task == task]
-        what = "episodes of 256 that end at the goal" if column == "successes" else "certified return"
-        columns = [f"{mark:.0e}".replace("e+0", "e") for mark in MARKS]
-        parts += [
-            f"\n**{task}: {what}**\n",
-            f"| method | {' | '.join(columns)} | each seed |",
-            "| --- |" + " --- |" * 4,
+    """The results in Markdown: the median over the seeds at each mark, with the range."""
+    head = ["method", *(f"{shown.title}, {mark:.0e}".replace("e+0", "e") for shown in SHOWN for mark in shown.marks)]
+    lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
+    for method in METHODS:
+        cells = [
+            _cell(table[(table.task == shown.task) & (table.method == method)], shown.column, mark)
+            for shown in SHOWN
+            for mark in shown.marks
         ]
-        for method in METHODS:
-            of_method = of_task[of_task.method == method]
-            if of_method.empty:
-                continue
-            cells = []
-            for mark in MARKS:
-                at_mark = of_method[of_method.env_steps >= mark].groupby("seed")[column].first()
-                cells.append(_number(at_mark.median()) if len(at_mark) else "")
-                last = at_mark if len(at_mark) else None
-            seeds = "" if last is None else ", ".join(_number(value) for value in last)
-            parts.append(f"| {method} | {' | '.join(cells)} | {seeds} |")
-    return "\n".join(parts)
+        if any(cells):
+            lines.append(f"| {method} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(of_method: pd.DataFrame, column: str, mark: int) -> str:
+    """Median and range over the seeds, of the first row of each from the mark on; and how many seeds, if not five."""
+    values = of_method[of_method.env_steps >= mark].sort_values("env_steps").groupby("seed")[column].first()
+    if not len(values):
+        return ""
+    median = f"**{_number(values.median())}**"
+    if len(values) == 1:
+        return f"{median} (1 seed)"
+    seeds = "" if len(values) == SEEDS else f", {len(values)} seeds"
+    return f"{median} ({_number(values.min())} to {_number(values.max())}{seeds})"
 
 
 def _number(value: float) -> str:
@@ -144,7 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--seeds", metavar="A:B", default="0:5")
+    parser.add_argument("--seeds", metavar="A:B", default=f"0:{SEEDS}")
     parser.add_argument("--marks", nargs="+", type=lambda text: int(float(text.replace("_", ""))), default=MARKS)
     parser.add_argument("--table", action="store_true", help="run nothing")
     parser.add_argument("--config", type=Path, help="a trial: a config of your own")
