@@ -18,12 +18,12 @@ from es_service.store.folder import (
     explained,
     is_disk_full,
     remove_database,
-    sync_folder,
+    sync_file,
     write_config,
 )
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.repair import connect
-from es_service.store.schema import RunMeta, create_tables, meta_text
+from es_service.store.schema import RunMeta, create_tables
 
 _NEW_DATABASE = "run.db.new"
 _LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
@@ -80,10 +80,10 @@ def _build(place: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -
     remove_database(place / DATABASE)
     write_config(place, config_yaml)
     with closing(connect(new)) as connection:
-        create_tables(connection, meta_text(meta))
+        create_tables(connection, meta)
         store_beginning(connection, meta, beginning)
     os.replace(new, place / DATABASE)
-    sync_folder(place)
+    sync_file(place)
 
 
 def _move(place: Path, folder: Path) -> None:
@@ -95,7 +95,7 @@ def _move(place: Path, folder: Path) -> None:
             text = f"another program created {folder} while this run was being created; choose another folder"
             raise StoreError(text) from error
         raise
-    sync_folder(folder.absolute().parent)
+    sync_file(folder.absolute().parent)
 
 
 def _clear(place: Path, beside: bool) -> None:

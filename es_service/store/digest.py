@@ -26,15 +26,9 @@ from es_service.store.codec import column_bytes, decode_part, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
 from es_service.store.platforms import sound_platforms
-from es_service.store.rows import (
-    history_rows,
-    kept_rows,
-    newest_generation,
-    rows_in_force,
-    state_payload,
-    whole_states,
-)
+from es_service.store.rows import history_rows, newest_generation
 from es_service.store.schema import RunMeta
+from es_service.store.states import kept_rows, rows_in_force, state_payload, whole_states
 from es_service.store.tables import leading_values
 from es_service.store.verify import verify
 

@@ -20,25 +20,21 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
-from es_service.store.certifications import encoded, next_number
-from es_service.store.codec import Part, column_bytes, encode_changes, history_row, row_dict, rows_listed, state_sha256
+from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.kept import KeptStates
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
-from es_service.store.rows import history_rows, sound_part
-from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta, history_insert
+from es_service.store.rows import history_rows, insert_history
+from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta
+from es_service.store.states import KeptStates, insert_state, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
-Values = Mapping[str, int | float | None]
-"""One history row: column name -> value; NaN or None stands for no value."""
 _LOG = logger(__name__)
-RECENT_BYTES = 128 * 2**20
-"""Most bytes of parts that are kept decoded: elites of which new policies descend are read again and again."""
 NO_ROWS: Table = {}
 NOTHING = Beginning()
 """Beginning of an ordinary run."""
@@ -72,8 +68,6 @@ class RunStore:
         self._connection, verdict = open_sound(folder, self.notices)
         self.meta = verdict.meta
         self.generation = verdict.good
-        self._insert_history = history_insert(self.meta.columns)
-        self._heading = column_bytes(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
@@ -184,19 +178,15 @@ class RunStore:
         new = rows_listed(rows)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
         total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
-        history_values = history_row(
-            self.meta.columns, self._heading, generation, history, centres, state_sha256(total)
-        )
         self._hook("before_begin")
-        with self._transaction(f"storing generation {generation}") as execute:
+        with self._transaction(f"storing generation {generation}") as connection:
             # Delete first, so that the new rows use the pages of the old ones.
-            self._connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
-            insert = "INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)"
-            self._connection.executemany(insert, rows)
+            connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
+            insert_state(connection, rows)
             self._hook("mid_transaction")
-            execute(self._insert_history, history_values)
+            insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
             if self._recorded:
-                store_list(execute)
+                store_list(connection)
             self._hook("before_commit")
         self._recorded = False
         self.generation = generation
@@ -226,15 +216,15 @@ class RunStore:
             raise StoreError(
                 f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
-        with self._transaction("recording the platform") as execute:
+        with self._transaction("recording the platform") as connection:
             self._recorded = True
-            return record(execute, generation, platform)
+            return record(connection, generation, platform)
 
     @property
     def next_certification(self) -> int:
         """Number of the next certification."""
         with self._explaining("reading the certifications"):
-            return next_number(self._connection, self.meta.parent)
+            return certifications.next_number(self._connection, self.meta.parent)
 
     def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
         """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
@@ -242,16 +232,15 @@ class RunStore:
         Raises:
             StoreError: the disk is full, or the database cannot be written.
         """
-        rows = encoded(self.next_certification, policies)
-        with self._transaction("storing a certification") as execute:
-            for row in rows:
-                execute("INSERT INTO certification (number, rank, facts, payload, sha256) VALUES (?, ?, ?, ?, ?)", row)
-        self.upkeep.after_commit(sum(len(row[3]) for row in rows) + PAGE_BYTES)
+        number = self.next_certification
+        with self._transaction("storing a certification") as connection:
+            size = certifications.insert(connection, number, policies)
+        self.upkeep.after_commit(size + PAGE_BYTES)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""
         with self._explaining("reading the platforms"):
-            return newest_before(self._connection.execute, generation)
+            return newest_before(self._connection, generation)
 
     def close(self) -> None:
         """Make `run.db` a single file and release the lock. This may be called again.
@@ -285,14 +274,7 @@ class RunStore:
             raise explained(error, self.folder, doing) from error
 
     @contextlib.contextmanager
-    def _transaction(self, doing: str) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        with self._explaining(doing):
-            try:
-                self._connection.execute("BEGIN IMMEDIATE")
-                yield self._connection.execute
-                self._connection.execute("COMMIT")
-            except BaseException:
-                # After some errors, SQLite has already rolled back.
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
-                raise
+    def _transaction(self, doing: str) -> Iterator[sqlite3.Connection]:
+        with self._explaining(doing), self._connection as connection:  # which commits, or rolls back
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection
