@@ -12,7 +12,6 @@ import contextlib
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from numpy.typing import NDArray
@@ -59,24 +58,25 @@ class RunStore:
     """Arrays from which generation 0 starts; None if the run was created without them."""
 
     def __init__(self, folder: Path, lock: RunLock, hook: Callable[[str], None]) -> None:
-        """Open the run in `folder`, whose lock is held. Use `create` or `open` instead."""
+        """Open the run in `folder`, whose lock is held and released at the end. Use `create` or `open` instead."""
         self.folder = folder
         self.notices = []
         self.lock = lock
         self._hook = hook
         self._closed = self._recorded = False
-        self._connection, verdict = open_sound(folder, self.notices)
-        self.meta = verdict.meta
-        self.generation = verdict.good
-        try:
+        with contextlib.ExitStack() as closing:
+            closing.callback(lock.release)
+            self._connection, verdict = open_sound(folder, self.notices)
+            closing.callback(self._connection.close)
+            self.meta = verdict.meta
+            self.generation = verdict.good
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
                 self._kept = KeptStates(self._connection, verdict.kept, verdict.good)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
-        except BaseException:
-            self._connection.close()
-            raise
+            closing.callback(self.upkeep.finish)
+            self._closing = closing.pop_all()
 
     @classmethod
     def create(
@@ -92,8 +92,6 @@ class RunStore:
 
         Args:
             folder: path that does not exist, or an empty folder; missing parents are created.
-            config_yaml: text of `config.yaml`.
-            meta: description of the run.
             beginning: data with which the run begins; no run folder appears without them.
             hook: function that is called with the name of each step, for tests.
 
@@ -101,8 +99,7 @@ class RunStore:
             StoreError: the folder is not empty or cannot be written, or the columns of `meta` cannot be stored.
         """
         folder = Path(folder)
-        lock = create_run_folder(folder, config_yaml, meta, beginning)
-        return cls._holding(lock, folder, hook)
+        return cls(folder, create_run_folder(folder, config_yaml, meta, beginning), hook)
 
     @classmethod
     def open(cls, folder: Path, *, hook: Callable[[str], None] = no_hook) -> RunStore:
@@ -117,24 +114,13 @@ class RunStore:
             require_run_folder(folder)
         except OSError as error:
             raise explained(error, folder, "looking for a run") from error
-        return cls._holding(acquire_lock(folder), folder, hook)
-
-    @classmethod
-    def _holding(cls, lock: RunLock, folder: Path, hook: Callable[[str], None]) -> RunStore:
-        try:
-            return cls(folder, lock, hook)
-        except BaseException:
-            lock.release()
-            raise
+        return cls(folder, acquire_lock(folder), hook)
 
     def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
-        """State of the newest generation: part -> name -> array; empty before the first commit.
+        """State of the newest generation: part -> name -> array; empty before the first commit. Raises as `part`.
 
         Args:
             without: prefix of the names of parts that are left out; None to load all parts.
-
-        Raises:
-            StoreError: a part has been damaged since the run was opened.
         """
         names = self._kept.names()
         return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
@@ -204,13 +190,10 @@ class RunStore:
         return row_dict(self.meta.columns, newest.row)
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
-        """Record the platform of a generation that is not stored yet, and of those after it.
+        """Record the platform of a generation that is not stored yet, and of those after it, in place of their records.
 
-        This replaces the records of `generation` and later. Nothing is recorded if the platform is the same as before.
-        Returns whether it differs from that of the generations before, or is the first.
-
-        Raises:
-            StoreError: `generation` is already stored.
+        Returns whether it differs from that of the generations before, or is the first; otherwise nothing is recorded.
+        Raises StoreError if `generation` is already stored.
         """
         if self.generation is not None and generation <= self.generation:
             raise StoreError(
@@ -227,11 +210,8 @@ class RunStore:
             return certifications.next_number(self._connection, self.meta.parent)
 
     def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
-        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
-
-        Raises:
-            StoreError: the disk is full, or the database cannot be written.
-        """
+        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank. Raises
+        StoreError if the database cannot be written."""
         number = self.next_certification
         with self._transaction("storing a certification") as connection:
             size = certifications.insert(connection, number, policies)
@@ -247,21 +227,13 @@ class RunStore:
 
         If a reader still uses the database or the disk is full, SQLite's log remains beside it, and nothing is lost.
         """
-        if self._closed:
-            return
         self._closed = True
-        try:
-            self.upkeep.finish()
-        finally:
-            self._connection.close()
-            self.lock.release()
+        self._closing.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     @contextlib.contextmanager
