@@ -35,13 +35,10 @@ def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
     folder = Path(folder)
     try:
         connection, meta = _connected(folder)
+        with contextlib.closing(connection):
+            yield connection, meta
     except (sqlite3.Error, Damaged, OSError, UnicodeDecodeError) as error:
         raise _unreadable(folder, error) from error
-    with contextlib.closing(connection):
-        try:
-            yield connection, meta
-        except (sqlite3.Error, Damaged, UnicodeDecodeError) as error:
-            raise _unreadable(folder, error) from error
 
 
 def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:

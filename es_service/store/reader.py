@@ -54,9 +54,8 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
 def read_history(
     folder: Path, since_generation: int | None = None, limit: int | None = None
 ) -> list[dict[str, int | float]]:
-    """History rows in order, as values by column name; NaN stands for no value.
-
-    A row takes more than a hundred bytes per value; `read_history_columns` needs eight.
+    """History rows in order, as values by column name; NaN stands for no value. For a long history, use
+    `read_history_columns`, which needs a tenth of the memory.
 
     Args:
         since_generation: generation of the first row; None for all rows.
@@ -127,15 +126,8 @@ def _refuse_lost_end(connection: sqlite3.Connection, newest: int) -> None:
 def read_parts(
     folder: Path, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
 ) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation and its state, as (generation, arrays by name for each part).
-
-    Args:
-        generation: generation of the state; None for the newest.
-        wanted: function that tells from a part's name whether to read this part.
-
-    Raises:
-        StoreError: also if the state of this generation is not kept.
-    """
+    """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`.
+    Raises StoreError also if the state of this generation is not kept."""
     with reading(folder) as (connection, _):
         newest = newest_generation(connection)
         if newest is None:

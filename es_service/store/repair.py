@@ -28,12 +28,8 @@ def connect(file: Path) -> sqlite3.Connection:
 
 
 def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Verdict]:
-    """A connection to the folder's `run.db` and the result of its verification, after any necessary repair.
-
-    The caller must hold the lock.
-
-    Args:
-        notices: list to which messages about repairs are added.
+    """A connection to the folder's `run.db` and the result of its verification, after any necessary repair, about which
+    messages are added to `notices`. The caller must hold the lock.
 
     Raises:
         StoreError: neither the database nor its copy can be used, or a file cannot be accessed.
@@ -127,10 +123,8 @@ def _reach(copy: Path) -> int:
 
 
 def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
-    """Replace `run.db`, which is kept under another name, by the verified copy.
-
-    If this process is killed at any point, this function can be called again.
-    """
+    """Replace `run.db`, which is kept under another name, by the verified copy. If this process is killed at any point,
+    this function can be called again."""
     file, copy, restored = folder / DATABASE, folder / COPY, folder / f"{DATABASE}.restored"
     if not copy.exists():
         raise StoreError(

@@ -70,13 +70,10 @@ class Followed:
         self._known: dict[str, tuple[tuple[int, str], Arrays | None]] = {}
 
     def read(self, most: int | None = None) -> tuple[SoundRun, bool]:
-        """The run as far as it is read now, and whether these are all of its rows.
+        """The run as far as it is read now, and whether these are all of its rows. Raises as `read_sound`.
 
         Args:
             most: most new rows to be read, so that the transaction is short; None: all, and this is the last time.
-
-        Raises:
-            StoreError: as `read_sound`.
         """
         problems: list[str] = []
         with _any_sound(self.folder, problems) as (connection, meta):

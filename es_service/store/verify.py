@@ -44,11 +44,9 @@ class Verdict:
 
 
 def verify(connection: sqlite3.Connection, file: Path, known: int = 0) -> Verdict:
-    """Check everything in a database; this reads all of it once.
+    """Check everything in the database `file`; this reads all of it once.
 
     Args:
-        connection: connection to the database.
-        file: path of the database.
         known: number of history rows, from generation 0 on, that are known to be intact. They are not checked again,
             except the last two.
 
@@ -104,9 +102,8 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
         is_there = row.generation == count
         if not (is_there and is_sound):
             bad.append(count)
-            problems.append(
-                f"history row of generation {count} {'does not match its SHA-256' if is_there else 'is missing'}"
-            )
+            what = "does not match its SHA-256" if is_there else "is missing"
+            problems.append(f"history row of generation {count} {what}")
         count += 1
         if not is_there:
             break
