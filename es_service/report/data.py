@@ -28,7 +28,6 @@ from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.store.columns import as_floats
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
@@ -175,8 +174,9 @@ def followed(folder: Path) -> Followed:
 
 
 def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
-    """Columns as floats; `columns` is emptied, so that a long history is in memory once."""
-    return {name: as_floats(columns.pop(name)) for name in list(columns)}
+    """Columns as floats, in which NaN stands for no value; `columns` is emptied, so that a long history is in memory
+    once."""
+    return {name: np.ma.filled(columns.pop(name).astype(np.float64, copy=False), np.nan) for name in list(columns)}
 
 
 def _map(found: SoundRun, problems: list[str]) -> BehaviourMap | None:

@@ -28,17 +28,10 @@ from es_service.runs.view import Run
 from es_service.runs.worker_count import on_this_machine
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
-from es_service.store.codec import (
-    changed_sum,
-    encode_changes,
-    row_dict,
-    row_values,
-    rows_listed,
-    state_sha256,
-    state_sum,
-)
+from es_service.store.codec import changed_sum, encode_changes, rows_listed, state_sha256, state_sum, stored_values
 from es_service.store.lock import require_unlocked
-from es_service.store.rows import KeptRows, rows_in_force
+from es_service.store.rows import HistoryRow as StoredRow
+from es_service.store.states import KeptRows, rows_in_force
 from es_service.store.tables import table_bytes
 
 
@@ -172,8 +165,7 @@ class _Comparison:
         self._changed |= parts
         self.reached = generation
         stored = reader.read_row(self._run.folder, generation)
-        values = row_dict(self._run.meta.columns, stored.row)
-        found = _history_differences(self._run, generation, values, history)
+        found = _history_differences(self._run, stored, history)
         if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:
             found.append("the evaluated centres")
         if state_sha256(self._sum) != stored.state:
@@ -183,16 +175,14 @@ class _Comparison:
             raise _End
 
 
-def _history_differences(run: Run, generation: int, stored: Mapping[str, Any], computed: HistoryRow) -> list[str]:
+def _history_differences(run: Run, stored: StoredRow, computed: HistoryRow) -> list[str]:
     """Deterministic columns of the history that differ, with both values."""
-    columns = [column for column in run.meta.columns if column.deterministic]
-    named = {column.name: computed.get(column.name) for column in columns}
-    values = row_values(columns, generation, named)
-    before = row_values(columns, generation, {column.name: stored[column.name] for column in columns})
+    columns = run.meta.columns
+    values = stored_values(columns, {**computed, "generation": stored.generation})
     return [
         f"{column.name} is {_shown(new)} instead of {_shown(old)}"
-        for column, old, new in zip(columns, before, values, strict=True)
-        if old != new
+        for column, old, new in zip(columns, stored.row, values, strict=True)
+        if column.deterministic and old != new
     ]
 
 

@@ -21,10 +21,10 @@ from es_service.runs.certified import certified_policies, newest_certified
 from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
-from es_service.store.columns import Columns
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.folder import CONFIG
 from es_service.store.schema import RunMeta
+from es_service.store.tables import Columns
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,20 +38,15 @@ class CertifiedRow:
     arrays: Mapping[str, NDArray[Any]]
 
 
-def row_sha256(number: object, rank: object, facts: object, payload: bytes) -> str:
-    """SHA-256 of a row, over all of its values."""
-    digest = hashlib.sha256(f"certification\0{number}\0{rank}\0{facts}\0".encode())
-    digest.update(payload)
-    return digest.hexdigest()
-
-
-def encoded(number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> list[tuple[Any, ...]]:
-    """The rows of a certification, of (facts, arrays) of each policy in the order of rank."""
-    found = []
+def insert(connection: sqlite3.Connection, number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> int:
+    """Store a certification: (facts, arrays) of each policy in the order of rank. Returns the bytes of the arrays."""
+    size = 0
     for rank, (facts, arrays) in enumerate(policies):
         text, payload = json.dumps(facts, sort_keys=True), encode_part(arrays)
-        found.append((number, rank, text, payload, row_sha256(number, rank, text, payload)))
-    return found
+        row = (number, rank, text, payload, _sha256(number, rank, text, payload))
+        connection.execute("INSERT INTO certification VALUES (?, ?, ?, ?, ?)", row)
+        size += len(payload)
+    return size
 
 
 def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None) -> int:
@@ -66,43 +61,35 @@ def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None
     return max(stored, (parent or {}).get(CERTIFICATIONS, 0))
 
 
+def rows(connection: sqlite3.Connection, *, newest: bool = False) -> list[tuple[Key, CertifiedRow | None]]:
+    """The rows that were not removed, in the order of number and rank; None for the content of a damaged one.
+
+    Args:
+        newest: only the rows of the newest certification of which there are any.
+    """
+    found: list[tuple[Key, CertifiedRow | None]] = []
+    query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number"
+    for number, rank, facts, payload, sha256 in connection.execute(f"{query} {'DESC' if newest else ''}, rank"):
+        if newest and found and found[0][0][0] != number:
+            break
+        if not isinstance(payload, bytes) or _sha256(number, rank, facts, payload) != sha256:
+            found.append(((number, rank), None))
+        elif facts != _REMOVED:
+            found.append(((number, rank), CertifiedRow(number, rank, json.loads(facts), decode_part(payload))))
+    return found
+
+
 def remove(connection: sqlite3.Connection, keys: Iterable[Key]) -> None:
     """Empty damaged rows. Their numbers remain, since another certification with one would have the same episodes."""
     for number, rank in keys:
-        sha256 = row_sha256(number, rank, _REMOVED, b"")
         connection.execute(
             "UPDATE certification SET facts = ?, payload = ?, sha256 = ? WHERE number IS ? AND rank IS ?",
-            (_REMOVED, b"", sha256, number, rank),
+            (_REMOVED, b"", _sha256(number, rank, _REMOVED, b""), number, rank),
         )
 
 
-def damaged_rows(connection: sqlite3.Connection) -> list[Key]:
-    """The rows that do not match their SHA-256."""
-    return [(number, rank) for number, rank, row in rows(connection) if row is None]
-
-
-def rows(
-    connection: sqlite3.Connection, where: str = "", values: Sequence[Any] = ()
-) -> list[tuple[int, int, CertifiedRow | None]]:
-    """Number, rank and content of all rows that were not removed, in the order of number and rank; None for the content
-    of a damaged one."""
-    query = f"SELECT number, rank, facts, payload, sha256 FROM certification {where} ORDER BY number, rank"
-    return [(row[0], row[1], _decoded(row)) for row in connection.execute(query, values) if not _is_removed(row)]
-
-
-def newest_rows(connection: sqlite3.Connection) -> list[tuple[int, int, CertifiedRow | None]]:
-    """`rows` of the newest certification of which there are any."""
-    numbers = connection.execute("SELECT DISTINCT number FROM certification ORDER BY number DESC").fetchall()
-    return next((found for number in numbers if (found := rows(connection, "WHERE number IS ?", number))), [])
-
-
-def _is_removed(row: Sequence[Any]) -> bool:
-    number, rank, facts, payload, sha256 = row
-    return facts == _REMOVED and payload == b"" and sha256 == row_sha256(number, rank, _REMOVED, b"")
-
-
-def _decoded(row: Sequence[Any]) -> CertifiedRow | None:
-    number, rank, facts, payload, sha256 = row
-    if not isinstance(payload, bytes) or row_sha256(number, rank, facts, payload) != sha256:
-        return None
-    return CertifiedRow(number, rank, json.loads(facts), decode_part(payload))
+def _sha256(number: object, rank: object, facts: object, payload: bytes) -> str:
+    """SHA-256 of a row, over all of its values."""
+    digest = hashlib.sha256(f"certification\0{number}\0{rank}\0{facts}\0".encode())
+    digest.update(payload)
+    return digest.hexdigest()

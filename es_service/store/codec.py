@@ -18,12 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.loop.history import Column
+from es_service.loop.history import NO_INTEGER, Column
 
 Part = Mapping[str, NDArray[Any]]
 """A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
 Row = tuple[int | float | None, ...]
 """Values of one history row in the order of the run's columns; None stands for no value."""
+Values = Mapping[str, int | float | None]
+"""The same by the names of the columns; NaN or None stands for no value."""
+StateRow = tuple[str, int, str, bytes]
+"""A state row: its part, its generation, its SHA-256 and its payload."""
+ListedRows = Mapping[str, tuple[int, str]]
+"""State rows without their payloads: part -> (generation, SHA-256 or GONE)."""
 
 NO_PAYLOAD = b""
 """Payload of a row that removes its part from the state, from its generation on."""
@@ -34,17 +40,13 @@ _HEADER_LENGTH = struct.Struct("<I")
 INTEGER = struct.Struct("<cq")
 REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
-_SUM_MODULUS = 2**256
 
 
 def encode_part(part: Part) -> bytes:
-    """A state part as bytes.
+    """A state part as bytes: a magic number, the length of the header, the JSON header [[name, dtype, shape], ...]
+    sorted by name, and the values of the arrays in little-endian byte order.
 
-    They are a magic number, the length of the header, the JSON header [[name, dtype, shape], ...] sorted by name, and
-    the values of the arrays in little-endian byte order.
-
-    Raises:
-        StoreError: an array has neither bools nor numbers.
+    Raises StoreError if an array has neither bools nor numbers.
     """
     header: list[tuple[str, str, tuple[int, ...]]] = []
     raw: list[bytes] = []
@@ -66,11 +68,7 @@ def _header(entries: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
 
 
 def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays that `encode_part` encoded, writable.
-
-    Raises:
-        ValueError: `payload` is not exactly one encoded part.
-    """
+    """The arrays that `encode_part` encoded, writable. Raises ValueError if `payload` is not exactly one such part."""
     if payload[:4] != _MAGIC or len(payload) < 8:
         raise ValueError(f"a state payload begins with {payload[:4]!r} instead of {_MAGIC!r}")
     position = 8 + _HEADER_LENGTH.unpack_from(payload, 4)[0]
@@ -103,34 +101,31 @@ def listed(sha256: str, payload: bytes) -> str:
     return sha256 if payload != NO_PAYLOAD else GONE
 
 
-def encode_changes(generation: int, parts: Mapping[str, Part | None]) -> list[tuple[str, int, str, bytes]]:
-    """State rows as they are stored, (part, generation, SHA-256, payload), of the parts that a generation changes; a
-    part that is None is removed."""
+def encode_changes(generation: int, parts: Mapping[str, Part | None]) -> list[StateRow]:
+    """State rows as they are stored, of the parts that a generation changes; a part that is None is removed."""
     payloads = ((part, NO_PAYLOAD if arrays is None else encode_part(arrays)) for part, arrays in parts.items())
     return [(part, generation, part_sha256(part, generation, payload), payload) for part, payload in payloads]
 
 
-def rows_listed(rows: Sequence[tuple[str, int, str, bytes]]) -> dict[str, tuple[int, str]]:
-    """State rows by part, without payloads: part -> (generation, SHA-256 or GONE)."""
+def rows_listed(rows: Sequence[StateRow]) -> ListedRows:
+    """State rows by part, without payloads."""
     return {part: (at, listed(sha256, payload)) for part, at, sha256, payload in rows}
 
 
-def state_sum(rows: Mapping[str, tuple[int, str]]) -> int:
-    """Number that identifies the whole state of a generation: the sum modulo 2^256 of one SHA-256 for each part.
+def state_sum(rows: ListedRows) -> int:
+    """Number that identifies the whole state of a generation, of which `rows` are the newest row of each part: the sum
+    modulo 2^256 of one SHA-256 for each part.
 
     A generation that changes few of many parts changes few terms of the sum. A part that was removed has no term, so
     that the row that removed it need not be kept when no older row of the part is.
-
-    Args:
-        rows: part -> (generation, sha256 or GONE) of its newest row.
     """
-    terms = (_row_term(part, at, sha256) for part, (at, sha256) in rows.items() if sha256 != GONE)
-    return sum(terms) % _SUM_MODULUS
+    terms = (f"{part}\0{at}\0{sha256}".encode() for part, (at, sha256) in rows.items() if sha256 != GONE)
+    return sum(int.from_bytes(hashlib.sha256(term).digest()) for term in terms) % 2**256
 
 
-def changed_sum(total: int, old: Mapping[str, tuple[int, str]], new: Mapping[str, tuple[int, str]]) -> int:
+def changed_sum(total: int, old: ListedRows, new: ListedRows) -> int:
     """`state_sum` after the rows `new` have replaced the rows `old` in a state whose sum is `total`."""
-    return (total - state_sum(old) + state_sum(new)) % _SUM_MODULUS
+    return (total - state_sum(old) + state_sum(new)) % 2**256
 
 
 def state_sha256(total: int) -> str:
@@ -139,21 +134,15 @@ def state_sha256(total: int) -> str:
     return f"{total:064x}"
 
 
-def _row_term(part: str, generation: int, sha256: str) -> int:
-    return int.from_bytes(hashlib.sha256(f"{part}\0{generation}\0{sha256}".encode()).digest())
-
-
 def text_sha256(key: str, text: str) -> str:
     """SHA-256 of a row that consists of a key and a JSON text."""
     return hashlib.sha256(f"{key}\0{text}".encode()).hexdigest()
 
 
-def row_values(columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None]) -> Row:
+def row_values(columns: Sequence[Column], generation: int, history: Values) -> Row:
     """Values of a history row as they are stored: NaN becomes None, and -0.0 becomes 0.0, as in SQLite.
 
     Args:
-        columns: columns of the run.
-        generation: generation of the row.
         history: value of each column; `generation` may be left out.
 
     Raises:
@@ -171,11 +160,16 @@ def row_values(columns: Sequence[Column], generation: int, history: Mapping[str,
         raise StoreError(
             f"history row of generation {generation}: its column generation has the value {given['generation']}"
         )
-    return tuple(stored_value(column, given[column.name]) for column in columns)
+    return stored_values(columns, given)
 
 
-def stored_value(column: Column, value: Any) -> int | float | None:
-    """A value as it is stored; see `row_values`."""
+def stored_values(columns: Sequence[Column], given: Values) -> Row:
+    """The values of `columns` as they are stored; a column that is not given has no value. Raises StoreError for a
+    value of the wrong type."""
+    return tuple(_stored_value(column, given.get(column.name)) for column in columns)
+
+
+def _stored_value(column: Column, value: Any) -> int | float | None:
     if value is None or value != value:
         return None
     try:
@@ -184,13 +178,13 @@ def stored_value(column: Column, value: Any) -> int | float | None:
         integer = operator.index(value)
     except TypeError as error:
         raise StoreError(f"history column {column.name} is {column.type} and cannot hold {value!r}") from error
-    if not -(2**63) < integer < 2**63:
+    if not NO_INTEGER < integer < 2**63:
         raise StoreError(f"history column {column.name} cannot hold {value!r}: it does not fit into 64 bits")
     return integer
 
 
 def row_bytes(row: Row) -> bytes:
-    """Bytes of the values of a history row, for its SHA-256. Raises ValueError for a value that is not a number."""
+    """Bytes of the values of a row, for its SHA-256. Raises ValueError for a value that is not a number."""
     parts: list[bytes] = []
     for value in row:
         if value is None:
@@ -213,27 +207,6 @@ def row_sha256(columns: bytes, row: Row, evaluations: bytes, state: str) -> str:
     """SHA-256 of a history row: of its columns (`column_bytes`), its values, and the `state_sha256` and the evaluated
     centres stored with it."""
     return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode(), evaluations))).hexdigest()
-
-
-def history_row(
-    columns: Sequence[Column],
-    heading: bytes,
-    generation: int,
-    history: Mapping[str, int | float | None],
-    evaluations: bytes,
-    state: str,
-) -> tuple[int | float | str | bytes | None, ...]:
-    """A history row as it is stored, with the evaluated centres (`table_bytes`), the `state_sha256` of its generation
-    and its own SHA-256 at the end.
-
-    Args:
-        heading: the columns as `column_bytes`.
-
-    Raises:
-        StoreError: as in `row_values`.
-    """
-    values = row_values(columns, generation, history)
-    return (*values, evaluations, state, row_sha256(heading, values, evaluations, state))
 
 
 def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:

@@ -8,10 +8,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from es_service.errors import StoreError, WayOut
-from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.store.folder import (
+    COPY,
+    DATABASE,
+    explained,
+    is_network_filesystem,
+    is_no_damage,
+    require_run_folder,
+)
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, load_meta
-from es_service.store.verify import is_no_damage
 
 _BUSY_S = 5.0
 
@@ -29,13 +35,10 @@ def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
     folder = Path(folder)
     try:
         connection, meta = _connected(folder)
+        with contextlib.closing(connection):
+            yield connection, meta
     except (sqlite3.Error, Damaged, OSError, UnicodeDecodeError) as error:
         raise _unreadable(folder, error) from error
-    with contextlib.closing(connection):
-        try:
-            yield connection, meta
-        except (sqlite3.Error, Damaged, UnicodeDecodeError) as error:
-            raise _unreadable(folder, error) from error
 
 
 def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
@@ -57,10 +60,8 @@ def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
 
 
 def connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
-    """A read-only connection to a database, inside a transaction, and the description of its run.
-
-    Raises Damaged, StoreError or sqlite3.Error if it cannot be read.
-    """
+    """A read-only connection to a database, inside a transaction, and the description of its run. Raises Damaged,
+    StoreError or sqlite3.Error if it cannot be read."""
     uri = f"{file.absolute().as_uri()}?mode=ro"
     connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
     try:

@@ -18,12 +18,12 @@ from es_service.store.folder import (
     explained,
     is_disk_full,
     remove_database,
-    sync_folder,
+    sync_file,
     write_config,
 )
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.repair import connect
-from es_service.store.schema import RunMeta, create_tables, meta_text
+from es_service.store.schema import RunMeta, create_tables
 
 _NEW_DATABASE = "run.db.new"
 _LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
@@ -39,39 +39,38 @@ def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: 
         StoreError: the folder is not empty or cannot be written.
     """
     try:
-        return _create(folder, config_yaml, meta, beginning)
+        _refuse_taken(folder)
+        # An existing folder may be a mount point or the current folder of a process, which a rename must not replace.
+        beside = not folder.is_dir()
+        place = folder.absolute().parent / f".{folder.name}.creating" if beside else folder
+        _make_folder(place, folder)
+        lock = acquire_lock(place)
+        try:
+            _refuse_taken(folder)  # another process may have created a run here before this one got the lock
+            _build(place, config_yaml, meta, beginning)
+            if beside:
+                _move(place, folder)
+        except BaseException:
+            # The same command can then be repeated. A complete run is kept.
+            if beside or not (place / DATABASE).exists():
+                _remove(place, whole=beside)
+            lock.release()
+            raise
     except (sqlite3.Error, OSError) as error:
         raise explained(error, folder, "creating the run", "try again") from error
+    return lock
 
 
-def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
-    _refuse_taken(folder)
-    parent = folder.absolute().parent
-    # An existing folder may be a mount point or the current folder of a process, which a rename must not replace.
-    beside = not folder.is_dir()
-    place = parent / f".{folder.name}.creating" if beside else folder
+def _make_folder(place: Path, folder: Path) -> None:
     try:
-        parent.mkdir(parents=True, exist_ok=True)
-        place.mkdir(exist_ok=True)
+        place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        if is_disk_full(error, parent):
+        if is_disk_full(error, folder.absolute().parent):
             raise
         raise StoreError(
-            f"cannot create {folder}: {error.strerror} in {parent}; make that folder writable or choose another folder"
+            f"cannot create {folder}: {error.strerror} in {folder.absolute().parent}; make that folder writable or "
+            "choose another folder"
         ) from error
-    lock = acquire_lock(place)
-    try:
-        if not beside:
-            # Another process may have created a run here before this one got the lock.
-            _refuse_taken(folder)
-        _build(place, config_yaml, meta, beginning)
-        if beside:
-            _move(place, folder)
-    except BaseException:
-        _clear(place, beside)
-        lock.release()
-        raise
-    return lock
 
 
 def _build(place: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> None:
@@ -80,10 +79,10 @@ def _build(place: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -
     remove_database(place / DATABASE)
     write_config(place, config_yaml)
     with closing(connect(new)) as connection:
-        create_tables(connection, meta_text(meta))
+        create_tables(connection, meta)
         store_beginning(connection, meta, beginning)
     os.replace(new, place / DATABASE)
-    sync_folder(place)
+    sync_file(place)
 
 
 def _move(place: Path, folder: Path) -> None:
@@ -95,21 +94,7 @@ def _move(place: Path, folder: Path) -> None:
             text = f"another program created {folder} while this run was being created; choose another folder"
             raise StoreError(text) from error
         raise
-    sync_folder(folder.absolute().parent)
-
-
-def _clear(place: Path, beside: bool) -> None:
-    """Delete the files of a failed creation, so that the same command can be repeated. A complete run is kept."""
-    with contextlib.suppress(OSError):
-        remove_database(place / _NEW_DATABASE)
-        if beside:
-            remove_database(place / DATABASE)
-        elif (place / DATABASE).exists():
-            return
-        for name in (CONFIG, f"{CONFIG}.new", LOCK):
-            (place / name).unlink(missing_ok=True)
-        if beside:
-            place.rmdir()
+    sync_file(folder.absolute().parent)
 
 
 def remove_run_folder(folder: Path, *, whole: bool) -> None:
@@ -119,14 +104,18 @@ def remove_run_folder(folder: Path, *, whole: bool) -> None:
         RunLockedError: another process writes the run.
     """
     lock = acquire_lock(folder)
-    with contextlib.suppress(OSError):  # what remains is a run without a generation, which can be resumed
-        for name in (DATABASE, COPY):
+    _remove(folder, whole=whole)  # what remains is a run without a generation, which can be resumed
+    lock.release()
+
+
+def _remove(folder: Path, *, whole: bool) -> None:
+    with contextlib.suppress(OSError):
+        for name in (_NEW_DATABASE, DATABASE, COPY):
             remove_database(folder / name)
-        for name in (CONFIG, LOCK):
+        for name in (CONFIG, f"{CONFIG}.new", LOCK):
             (folder / name).unlink(missing_ok=True)
         if whole:
             folder.rmdir()
-    lock.release()
 
 
 def _refuse_taken(folder: Path) -> None:

@@ -26,19 +26,11 @@ from es_service.store.codec import column_bytes, decode_part, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
 from es_service.store.platforms import sound_platforms
-from es_service.store.rows import (
-    history_rows,
-    kept_rows,
-    newest_generation,
-    rows_in_force,
-    state_payload,
-    whole_states,
-)
+from es_service.store.rows import history_rows, newest_generation
 from es_service.store.schema import RunMeta
+from es_service.store.states import kept_rows, rows_in_force, state_payload, whole_states
 from es_service.store.tables import leading_values
 from es_service.store.verify import verify
-
-Connection = sqlite3.Connection
 
 
 def digest_of(parts: Mapping[str, str]) -> str:
@@ -48,14 +40,11 @@ def digest_of(parts: Mapping[str, str]) -> str:
 
 
 def digest_parts(folder: Path) -> dict[str, str]:
-    """The SHA-256s of which the digest is made, by name.
+    """The SHA-256s of which the digest is made, by name. Raises StoreError if the run cannot be read.
 
     `state/<part>` is that of the newest value of a state part, or of all of its pieces (`part/number`), `map` that of
     all parts of the behaviour map, and `history` that of the deterministic columns of the history, `evaluations` that
     of the evaluated centres.
-
-    Raises:
-        StoreError: the run cannot be read.
     """
     with reading(folder) as (connection, meta):
         return _parts(folder, connection, meta)
@@ -69,12 +58,10 @@ def digest_at(folder: Path, generation: int) -> str | None:
 
 
 def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
-    """`digest_parts`, and whether the generations were computed on more than one platform, by the driver or by workers.
+    """`digest_parts`, and whether the generations were computed on more than one platform, by the driver or by workers:
+    both of one transaction, in which everything that is stored was checked against its SHA-256 before.
 
-    Both are read in one transaction, after everything that is stored was checked against its SHA-256.
-
-    Raises:
-        StoreError: the run cannot be read, or is damaged; the message names the damaged data.
+    Raises StoreError if the run cannot be read, or is damaged; the message names the damaged data.
     """
     with reading(folder) as (connection, meta):
         if damage := verify(connection, folder / DATABASE).damage:
@@ -83,15 +70,12 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
                 run=folder,
                 ways_out=[WayOut("resume", "continue from the newest intact generation", str(folder))],
             )
-        return _parts(folder, connection, meta), _is_mixed(connection)
+        newest = newest_generation(connection)
+        platforms = [at for first, at in sound_platforms(connection) if newest is not None and first <= newest]
+        return _parts(folder, connection, meta), is_mixed(platforms)
 
 
-def _is_mixed(connection: Connection) -> bool:
-    newest = newest_generation(connection)
-    return is_mixed(at for first, at in sound_platforms(connection) if newest is not None and first <= newest)
-
-
-def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int | None = None) -> dict[str, str]:
+def _parts(folder: Path, connection: sqlite3.Connection, meta: RunMeta, until: int | None = None) -> dict[str, str]:
     """The parts as of a generation; None: of all that is stored."""
     try:
         history, evaluations = _history(connection, meta, until)
@@ -101,7 +85,7 @@ def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int | Non
         raise StoreError(f"{folder} has data that cannot be read: {error}", run=folder, ways_out=ways_out) from error
 
 
-def _state(connection: Connection, until: int | None) -> dict[str, str]:
+def _state(connection: sqlite3.Connection, until: int | None) -> dict[str, str]:
     newest = rows_in_force(kept_rows(connection), 2**63 if until is None else until)
     payloads = ((part, state_payload(connection, part, at)) for part, (at, _) in newest.items())
     parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads}
@@ -129,7 +113,7 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
     return total.hexdigest()
 
 
-def _history(connection: Connection, meta: RunMeta, until: int | None) -> tuple[str, str]:
+def _history(connection: sqlite3.Connection, meta: RunMeta, until: int | None) -> tuple[str, str]:
     """SHA-256s of the deterministic columns of the history, and of the evaluated centres."""
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
     # Columns of the evaluated centres that do not count are the last ones.

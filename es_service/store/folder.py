@@ -32,6 +32,10 @@ LOCAL_FUSE = frozenset({"fuse.fuse-overlayfs", "fuse.ntfs-3g", "fuse.fuse2fs"})
 """FUSE file systems that are local."""
 _LITTLE_SPACE = 256 * 1024
 """Free bytes below which a plain I/O error is taken for a full disk."""
+_BUSY = {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
+_NO_ACCESS = {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN}
+_NOT_DAMAGE = _BUSY | _NO_ACCESS | {sqlite3.SQLITE_FULL, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_INTERRUPT}
+"""SQLite errors that do not mean that the file is damaged, so the file must not be replaced because of them."""
 
 
 def is_network_filesystem(path: Path, mountinfo: str | None = None) -> bool:
@@ -51,24 +55,16 @@ def is_network_filesystem(path: Path, mountinfo: str | None = None) -> bool:
     return kind in NETWORK_FILE_SYSTEMS or (kind.startswith("fuse.") and kind not in LOCAL_FUSE)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames inside `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync_file(path: Path) -> None:
+    """Make the content of a file, or the renames inside a folder, survive a power cut. Do not use it for an open
+    database: closing drops its locks."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
         # Some network file systems cannot fsync a folder, but there, renames are synchronous anyway.
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
             raise
-    finally:
-        os.close(descriptor)
-
-
-def sync_file(path: Path) -> None:
-    """Make the content of a file survive a power cut. Do not use it for an open database: closing drops its locks."""
-    descriptor = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
@@ -79,7 +75,7 @@ def write_config(folder: Path, text: str) -> None:
     new.write_text(text, encoding="utf-8")
     sync_file(new)
     os.replace(new, folder / CONFIG)
-    sync_folder(folder)
+    sync_file(folder)
 
 
 def remove_database(path: Path) -> None:
@@ -89,11 +85,8 @@ def remove_database(path: Path) -> None:
 
 
 def holds_run(folder: Path) -> bool:
-    """Whether a folder contains a run: its database, or the copy from which opening restores a lost database.
-
-    Raises:
-        StoreError: the folder cannot be accessed.
-    """
+    """Whether a folder contains a run: its database, or the copy from which opening restores a lost database. Raises
+    StoreError if the folder cannot be accessed."""
     try:
         return (folder / DATABASE).exists() or (folder / COPY).exists()
     except OSError as error:
@@ -116,11 +109,9 @@ def require_run_folder(folder: Path) -> None:
             ways_out=[WayOut("run", "start a run there", out=str(folder))],
         )
     if not holds_run(folder):
-        inside = sorted(runs_inside(folder))
-        if inside:
-            runs = (
-                f"{len(inside)} run folders, such as {inside[-1]}" if len(inside) > 1 else f"the run folder {inside[0]}"
-            )
+        if inside := sorted(runs_inside(folder)):
+            several = f"{len(inside)} run folders, such as {inside[-1]}"
+            runs = several if len(inside) > 1 else f"the run folder {inside[0]}"
             raise StoreError(f"{folder} is not a run folder, but contains {runs}", run=folder)
         raise StoreError(
             f"{folder} is not a run folder: it contains no {DATABASE}, and no run folders, as a sweep does. If the "
@@ -143,12 +134,17 @@ def is_disk_full(error: BaseException, folder: Path) -> bool:
     return code == sqlite3.SQLITE_FULL
 
 
+def is_no_damage(error: BaseException, folder: Path) -> bool:
+    """Whether an error does not mean that the database in `folder` is damaged: it may have been busy or not accessible,
+    or the disk too full for the files that SQLite writes beside it."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    return isinstance(error, OSError) or code in _NOT_DAMAGE or is_disk_full(error, folder)
+
+
 def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: str | None = None) -> StoreError:
     """The StoreError for a failure of SQLite or the operating system in a run folder.
 
     Args:
-        error: the failure.
-        folder: the run folder.
         doing: the operation that failed, after "while": "reading the run".
         then: what the user should do after removing the cause, as an imperative; None to suggest resuming the run.
     """
@@ -161,9 +157,9 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
             ways_out=ways_out,
         )
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+    if code in _BUSY:
         hint = f"Another program has {folder / DATABASE} open; close that program"
-    elif code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN) or isinstance(error, OSError):
+    elif code in _NO_ACCESS or isinstance(error, OSError):
         hint = "Check that the folder and its files exist and can be read and written"
     else:
         hint = "Everything stored before is safe; check the disk"

@@ -26,6 +26,7 @@ _PATIENCE_S = 0.5
 """Seconds for which a writer tries to take the lock, because `lock_holder` holds a shared lock for an instant."""
 _MOST, _MOST_WORDS = 4096, 500
 """Bytes of the file that are read, and characters of the words about an end, which always fit into them."""
+_OF_HOLDER = ("host", "pid", "since", "waiting_since", "doing")
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _held: weakref.WeakSet[RunLock] = weakref.WeakSet()
 
@@ -76,8 +77,23 @@ def acquire_lock(folder: Path) -> RunLock:
         RunLockedError: another process holds the lock.
         StoreError: the lock file cannot be created or locked.
     """
+    deadline = time.monotonic() + _PATIENCE_S
     try:
-        return _acquire(folder, time.monotonic() + _PATIENCE_S)
+        while True:
+            with contextlib.ExitStack() as closing:
+                descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                closing.callback(os.close, descriptor)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    if time.monotonic() > deadline:
+                        raise _locked(folder) from None
+                    time.sleep(0.02)
+                    continue
+                if _is_at(descriptor, folder / LOCK):
+                    lock = RunLock(descriptor)
+                    closing.pop_all()
+                    return lock
     except OSError as error:
         if error.errno in _NO_LOCKS:
             raise StoreError(
@@ -86,25 +102,6 @@ def acquire_lock(folder: Path) -> RunLock:
                 run=folder,
             ) from error
         raise explained(error, folder, f"locking {LOCK}") from error
-
-
-def _acquire(folder: Path, deadline: float) -> RunLock:
-    path = folder / LOCK
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is_at(descriptor, path):
-                return RunLock(descriptor)
-        except BlockingIOError:
-            if time.monotonic() > deadline:
-                os.close(descriptor)
-                raise _locked(folder) from None
-            time.sleep(0.02)
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
 
 
 def _now() -> str:
@@ -120,11 +117,10 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def lock_holder(folder: Path) -> dict[str, Any] | None:
-    """The process that holds the lock of the run in `folder`; None if there is none.
+    """The process that holds the lock of the run in `folder`: "host", "pid" and "since" (ISO time, UTC), and
+    "waiting_since" and "doing" of `RunLock.say`. All are None if the writer has not written them yet.
 
-    Returns:
-        "host", "pid" and "since" (ISO time, UTC), "waiting_since" if the run waits for its first worker, else None, and
-        "doing", see `RunLock.say`. All are None if the writer has not written them yet.
+    None if no process holds the lock.
     """
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
@@ -135,7 +131,8 @@ def lock_holder(folder: Path) -> dict[str, Any] | None:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return None
     except BlockingIOError:
-        return _identity(_content(os.pread(descriptor, _MOST, 0)))
+        known = _content(os.pread(descriptor, _MOST, 0))
+        return {key: known.get(key) for key in _OF_HOLDER}
     except OSError:
         return None
     finally:
@@ -149,8 +146,8 @@ def require_unlocked(folder: Path) -> None:
 
 
 def last_end(folder: Path) -> str:
-    """How the last session of the run in `folder` ended, in words, if no process holds its lock; empty if the session
-    has not said it, as before version 0.17, or if there was none."""
+    """How the last session of a run whose lock is free ended, in words; empty if the session has not said it, as before
+    version 0.17, or if there was none."""
     try:
         found = _content((folder / LOCK).read_bytes()[:_MOST])
     except OSError:
@@ -170,15 +167,12 @@ def _content(text: bytes) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _identity(known: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: known.get(key) for key in ("host", "pid", "since", "waiting_since", "doing")}
-
-
 def _locked(folder: Path) -> RunLockedError:
-    holder = lock_holder(folder) or _identity({})
+    holder = lock_holder(folder) or {}
+    pid, host, since = (holder.get(key) or "(unknown)" for key in ("pid", "host", "since"))
     return RunLockedError(
-        f"{folder} is being written by process {holder['pid'] or '(unknown)'} on host {holder['host'] or '(unknown)'} "
-        f"since {holder['since'] or '(unknown)'}; stop that process first, or wait until it ends.",
+        f"{folder} is being written by process {pid} on host {host} since {since}; stop that process first, or wait "
+        "until it ends.",
         run=folder,
         ways_out=[WayOut("watch", "watch it", str(folder))],
     )

@@ -19,22 +19,12 @@ from es_service.store import certifications
 from es_service.store.beginning import load_start
 from es_service.store.certifications import CertifiedRow
 from es_service.store.codec import row_dict
-from es_service.store.columns import Columns, Table
 from es_service.store.connection import reading
 from es_service.store.platforms import sound_platforms
-from es_service.store.rows import (
-    HistoryRow,
-    KeptRows,
-    history_rows,
-    kept_rows,
-    newest_generation,
-    newest_state,
-    rows_in_force,
-    sound_part,
-    whole_states,
-)
+from es_service.store.rows import HistoryRow, history_rows, newest_generation
 from es_service.store.schema import Damaged, RunMeta
-from es_service.store.tables import table_rows
+from es_service.store.states import KeptRows, kept_rows, newest_state, rows_in_force, sound_part, whole_states
+from es_service.store.tables import Columns, GrowingTable, table_rows
 
 GENERATION = Column("generation", "INTEGER", True, "generation that evaluated the centre")
 """The column before those of the evaluated centres."""
@@ -64,9 +54,8 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
 def read_history(
     folder: Path, since_generation: int | None = None, limit: int | None = None
 ) -> list[dict[str, int | float]]:
-    """History rows in order, as values by column name; NaN stands for no value.
-
-    A row takes more than a hundred bytes per value; `read_history_columns` needs eight.
+    """History rows in order, as values by column name; NaN stands for no value. For a long history, use
+    `read_history_columns`, which needs a tenth of the memory.
 
     Args:
         since_generation: generation of the first row; None for all rows.
@@ -80,7 +69,7 @@ def read_history(
 def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
     """The history from generation 0 on, as columns; `limit` as in `read_history`."""
     with reading(folder) as (connection, meta):
-        table = Table(meta.columns)
+        table = GrowingTable(meta.columns)
         for one in _sound_rows(connection, meta, 0, limit):
             table.add(one.row)
         return table.columns()
@@ -98,7 +87,7 @@ def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
     """The evaluated centres of all generations, as columns, the first of which is `generation`; `limit`: of
     generations."""
     with reading(folder) as (connection, meta):
-        table = Table((GENERATION, *meta.evaluation_columns))
+        table = GrowingTable((GENERATION, *meta.evaluation_columns))
         for one in _sound_rows(connection, meta, 0, limit):
             for row in table_rows(meta.evaluation_columns, one.evaluations):
                 table.add((one.generation, *row))
@@ -137,15 +126,8 @@ def _refuse_lost_end(connection: sqlite3.Connection, newest: int) -> None:
 def read_parts(
     folder: Path, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
 ) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation and its state, as (generation, arrays by name for each part).
-
-    Args:
-        generation: generation of the state; None for the newest.
-        wanted: function that tells from a part's name whether to read this part.
-
-    Raises:
-        StoreError: also if the state of this generation is not kept.
-    """
+    """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`.
+    Raises StoreError also if the state of this generation is not kept."""
     with reading(folder) as (connection, _):
         newest = newest_generation(connection)
         if newest is None:
@@ -199,8 +181,9 @@ def next_certification(folder: Path) -> int:
 def read_certifications(folder: Path, *, newest: bool = False) -> list[CertifiedRow]:
     """All certified policies, in the order of certification and rank; with `newest` those of the last certification."""
     with reading(folder) as (connection, _):
-        found = certifications.newest_rows(connection) if newest else certifications.rows(connection)
-        for number, rank, row in found:
+        found = []
+        for (number, rank), row in certifications.rows(connection, newest=newest):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} does not match its SHA-256")
-        return [row for _, _, row in found if row is not None]
+            found.append(row)
+        return found

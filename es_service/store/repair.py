@@ -15,9 +15,9 @@ from pathlib import Path
 from es_service.errors import StoreError
 from es_service.store import certifications
 from es_service.store.connection import connected_to
-from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file, sync_folder
-from es_service.store.schema import GENERATION_TABLES, Damaged, history_shared, load_meta
-from es_service.store.verify import Verdict, check_header, verify
+from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file
+from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, Damaged, load_meta, quoted
+from es_service.store.verify import Verdict, verify
 
 _BUSY_S = 10.0
 
@@ -28,12 +28,8 @@ def connect(file: Path) -> sqlite3.Connection:
 
 
 def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Verdict]:
-    """A connection to the folder's `run.db` and the result of its verification, after any necessary repair.
-
-    The caller must hold the lock.
-
-    Args:
-        notices: list to which messages about repairs are added.
+    """A connection to the folder's `run.db` and the result of its verification, after any necessary repair, about which
+    messages are added to `notices`. The caller must hold the lock.
 
     Raises:
         StoreError: neither the database nor its copy can be used, or a file cannot be accessed.
@@ -54,13 +50,24 @@ def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Ve
 def _open_made_sound(file: Path, notices: list[str], copy: Path | None = None) -> tuple[sqlite3.Connection, Verdict]:
     if not file.exists():
         raise Damaged("it is missing")
-    check_header(file)
+    _check_header(file)
     connection = connect(file)
     try:
         return connection, _made_sound(connection, file, notices, copy)
     except BaseException:
         connection.close()
         raise
+
+
+def _check_header(file: Path) -> None:
+    """Raise Damaged if the header of a database is wrong. No connection of this process may have the file open."""
+    with file.open("rb") as stream:
+        header = stream.read(100)
+    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+        raise Damaged("it is not an SQLite database")
+    # Write and read version: 1 is a rollback journal, 2 is WAL. SQLite treats a file with others as read-only.
+    if header[18] != header[19] or header[18] not in (1, 2):
+        raise Damaged("its header names an unknown file format")
 
 
 def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], copy: Path | None) -> Verdict:
@@ -84,12 +91,12 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
         remove_database(old)
         with _new_copy(connection, old):
             kept = f"; the damaged database, with all generations, is kept as {old.name}"
-    connection.execute("BEGIN IMMEDIATE")
-    for table in GENERATION_TABLES:
-        connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
-    connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
-    certifications.remove(connection, verdict.bad_certifications)
-    connection.execute("COMMIT")
+    with connection:
+        connection.execute("BEGIN IMMEDIATE")
+        for table in GENERATION_TABLES:
+            connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
+        connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
+        certifications.remove(connection, verdict.bad_certifications)
     if verdict.good == verdict.newest:
         notices.append(
             f"{file}: {found}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
@@ -108,7 +115,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
 def _reach(copy: Path) -> int:
     """The newest intact generation of a copy; -1 if there is none, or if the copy cannot be read."""
     with suppress(sqlite3.Error, OSError, Damaged, StoreError):
-        check_header(copy)
+        _check_header(copy)
         with closing(connected_to(copy)[0]) as connection:
             good = verify(connection, copy).good
         return -1 if good is None else good
@@ -116,10 +123,8 @@ def _reach(copy: Path) -> int:
 
 
 def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
-    """Replace `run.db`, which is kept under another name, by the verified copy.
-
-    If this process is killed at any point, this function can be called again.
-    """
+    """Replace `run.db`, which is kept under another name, by the verified copy. If this process is killed at any point,
+    this function can be called again."""
     file, copy, restored = folder / DATABASE, folder / COPY, folder / f"{DATABASE}.restored"
     if not copy.exists():
         raise StoreError(
@@ -153,7 +158,7 @@ def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
         if log.exists():
             os.replace(log, folder / (DAMAGED + suffix))
     os.replace(restored, file)
-    sync_folder(folder)
+    sync_file(folder)
     notices.append(
         f"{file}: {damage}. Restored {COPY}, which reaches generation {verdict.good}"
         + (f"; the damaged file is kept as {DAMAGED}" if (folder / DAMAGED).exists() else "")
@@ -193,7 +198,7 @@ def _new_copy(connection: sqlite3.Connection, file: Path) -> Iterator[sqlite3.Co
             yield copy
         sync_file(temporary)
         os.replace(temporary, file)
-        sync_folder(file.parent)
+        sync_file(file.parent)
     except BaseException:
         remove_database(temporary)
         raise
@@ -208,12 +213,13 @@ def _known_rows(connection: sqlite3.Connection, former: Path) -> int:
         return 0
     # The former copy may be damaged, also the statements that SQLite's messages quote, or may be another file.
     with suppress(sqlite3.Error, UnicodeDecodeError):
-        columns = load_meta(connection, former).columns
+        names = [*(column.name for column in load_meta(connection, former).columns), *OWN_HISTORY_COLUMNS]
+        same = " AND ".join(f"ours.{quoted(name)} IS theirs.{quoted(name)}" for name in names)
+        shared = f"SELECT count(*) FROM former.history AS theirs JOIN main.history AS ours ON {same}"
         connection.execute("ATTACH ? AS former", (str(former),))
         try:
-            shared = connection.execute(history_shared(columns, "former")).fetchone()[0]
-            all_of_them = connection.execute("SELECT count(*) FROM former.history").fetchone()[0]
+            known, stored = connection.execute(f"SELECT ({shared}), (SELECT count(*) FROM former.history)").fetchone()
         finally:
             connection.execute("DETACH former")
-        return shared if shared == all_of_them else 0
+        return known if known == stored else 0
     return 0

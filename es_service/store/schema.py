@@ -6,12 +6,13 @@ import json
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from es_service.errors import StoreError
 from es_service.loop.history import Column
-from es_service.store.codec import text_sha256
+from es_service.store.codec import column_bytes, text_sha256
 
 SCHEMA_VERSION = 6
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
@@ -36,7 +37,7 @@ _CERTIFICATION = (
     "CREATE TABLE certification (number INTEGER NOT NULL, rank INTEGER NOT NULL, facts TEXT NOT NULL, "
     "payload BLOB NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (number, rank)) WITHOUT ROWID"
 )
-_OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
+OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
 """Columns of the table history besides those of the run: the evaluated centres (`tables.table_bytes`), the SHA-256 of
 the state, and that of the row."""
 
@@ -66,30 +67,15 @@ class RunMeta:
     """Run from which this one was forked or took its first centre: run id, folder, generation, digest. None if there is
     none."""
 
-
-def meta_text(meta: RunMeta) -> str:
-    """`meta` as JSON. Raises StoreError if no table can have its columns."""
-    names = [column.name.casefold() for column in meta.columns]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    reserved = sorted(set(names) & set(_OWN_HISTORY_COLUMNS))
-    if twice or reserved or ("generation", "INTEGER") not in [(column.name, column.type) for column in meta.columns]:
-        raise StoreError(
-            f"history columns: duplicate names {twice}, reserved names {reserved}; give each column its own name, and "
-            "include an INTEGER column `generation`"
-        )
-    return json.dumps(asdict(meta), sort_keys=True)
-
-
-def meta_from_text(text: str) -> RunMeta:
-    """The description of a run from its `meta_text`."""
-    fields = json.loads(text)
-    columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
-    return RunMeta(**{**fields, **columns})
+    @cached_property
+    def heading(self) -> bytes:
+        """The columns of the history, as they are hashed with each row."""
+        return column_bytes(self.columns)
 
 
 def table_statements(columns: Sequence[Column]) -> dict[str, str]:
     """Table name -> its CREATE TABLE statement."""
-    own = ", ".join(f"{name} {kind} NOT NULL" for name, kind in _OWN_HISTORY_COLUMNS.items())
+    own = ", ".join(f"{name} {kind} NOT NULL" for name, kind in OWN_HISTORY_COLUMNS.items())
     history = ", ".join(
         f"{quoted(column.name)} {column.type}" + (" PRIMARY KEY" if column.name == "generation" else "")
         for column in columns
@@ -103,17 +89,37 @@ def table_statements(columns: Sequence[Column]) -> dict[str, str]:
     }
 
 
-def create_tables(connection: sqlite3.Connection, text: str) -> None:
-    """Create the tables of a run in an empty database and store its `meta_text`, `text`."""
+def create_tables(connection: sqlite3.Connection, meta: RunMeta) -> None:
+    """Create the tables of a run in an empty database and store its description. Raises StoreError if no table can have
+    its columns."""
+    names = [column.name.casefold() for column in meta.columns]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    reserved = sorted(set(names) & set(OWN_HISTORY_COLUMNS))
+    if twice or reserved or ("generation", "INTEGER") not in [(column.name, column.type) for column in meta.columns]:
+        raise StoreError(
+            f"history columns: duplicate names {twice}, reserved names {reserved}; give each column its own name, and "
+            "include an INTEGER column `generation`"
+        )
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA auto_vacuum = NONE")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute("BEGIN IMMEDIATE")
-    for statement in table_statements(meta_from_text(text).columns).values():
-        connection.execute(statement)
-    for key, value in (("schema_version", str(SCHEMA_VERSION)), ("run", text)):
-        connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (key, value, text_sha256(key, value)))
-    connection.execute("COMMIT")
+    with connection:
+        connection.execute("BEGIN IMMEDIATE")
+        for statement in table_statements(meta.columns).values():
+            connection.execute(statement)
+        put_meta(connection, "schema_version", str(SCHEMA_VERSION))
+        put_meta(connection, "run", json.dumps(asdict(meta), sort_keys=True))
+
+
+def put_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
+    """Store a record in the table `meta`, in place of the former one."""
+    connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, value, text_sha256(key, value)))
+
+
+def get_meta(connection: sqlite3.Connection, key: str) -> str | None:
+    """The value of a record in the table `meta`, which `load_meta` has checked; None if there is none."""
+    row = connection.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+    return None if row is None else row[0]
 
 
 def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
@@ -141,27 +147,9 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
             f"{file} was written by an older version of es-service; use version {READ_BY[version]} to read or continue "
             f"it (its schema version is {version}, and this version of es-service supports {SCHEMA_VERSION})"
         )
-    return meta_from_text(found["run"])
-
-
-def history_insert(columns: Sequence[Column]) -> str:
-    """SQL statement that stores a history row: values in the order of `columns`, then those of the store's own."""
-    names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
-    return f"INSERT INTO history ({', '.join(map(quoted, names))}) VALUES ({', '.join('?' * len(names))})"
-
-
-def history_select(columns: Sequence[Column]) -> str:
-    """Beginning of an SQL query for history rows: values in the order of `columns`, then those of the store's own."""
-    # Names are qualified by the table, because SQLite treats an unqualified quoted name that is no column as a text.
-    names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
-    return f"SELECT {', '.join(f'history.{quoted(name)}' for name in names)} FROM history"
-
-
-def history_shared(columns: Sequence[Column], other: str) -> str:
-    """SQL query for the number of history rows that this database and the attached database `other` share."""
-    names = map(quoted, [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS))
-    same = " AND ".join(f"ours.{name} IS theirs.{name}" for name in names)
-    return f"SELECT count(*) FROM {other}.history AS theirs JOIN main.history AS ours ON {same}"
+    fields = json.loads(found["run"])
+    columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
+    return RunMeta(**fields | columns)
 
 
 def quoted(name: str) -> str:

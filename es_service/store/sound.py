@@ -17,23 +17,14 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError
 from es_service.store.codec import row_dict
-from es_service.store.columns import Columns, Table
 from es_service.store.connection import connected_to, reading
 from es_service.store.folder import COPY
 from es_service.store.platforms import sound_platforms
 from es_service.store.reader import GENERATION
-from es_service.store.rows import (
-    HistoryRow,
-    history_rows,
-    kept_rows,
-    newest_generation,
-    newest_state,
-    rows_in_force,
-    sound_part,
-    whole_states,
-)
+from es_service.store.rows import HistoryRow, history_rows, newest_generation
 from es_service.store.schema import Damaged, RunMeta
-from es_service.store.tables import table_rows
+from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_part, whole_states
+from es_service.store.tables import Columns, GrowingTable, table_rows
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[str, Arrays], Arrays | None]
@@ -79,13 +70,10 @@ class Followed:
         self._known: dict[str, tuple[tuple[int, str], Arrays | None]] = {}
 
     def read(self, most: int | None = None) -> tuple[SoundRun, bool]:
-        """The run as far as it is read now, and whether these are all of its rows.
+        """The run as far as it is read now, and whether these are all of its rows. Raises as `read_sound`.
 
         Args:
             most: most new rows to be read, so that the transaction is short; None: all, and this is the last time.
-
-        Raises:
-            StoreError: as `read_sound`.
         """
         problems: list[str] = []
         with _any_sound(self.folder, problems) as (connection, meta):
@@ -165,7 +153,8 @@ class _Rows:
 
     def __init__(self, meta: RunMeta) -> None:
         self._meta = meta
-        self.history, self.evaluations = Table(meta.columns), Table((GENERATION, *meta.evaluation_columns))
+        self.history = GrowingTable(meta.columns)
+        self.evaluations = GrowingTable((GENERATION, *meta.evaluation_columns))
         self.last: HistoryRow | None = None
         self._lost: list[range] = []
 

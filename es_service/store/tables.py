@@ -1,14 +1,15 @@
-"""Encoding of the rows that a generation has of each centre that it evaluated, all of them in one blob.
+"""Tables of numbers: as columns in memory, and as the bytes of the centres that a generation evaluated.
 
-The bytes are those of `codec.row_bytes` of each row, one after another; here they are made of columns, and of a batch
-of policies at once.
+Columns take eight bytes a value, where dictionaries of Python's numbers take more than a hundred. A long run has
+millions of generations, so whoever reads a whole history reads columns. The bytes are those of `codec.row_bytes` of
+each row, one after another; here they are made of columns, and of a batch of policies at once.
 """
 
 from __future__ import annotations
 
 import re
-import struct
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,43 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError
 from es_service.loop.history import NO_INTEGER, Column, Table
-from es_service.store.codec import INTEGER, REAL, Row, stored_value
+from es_service.store.codec import INTEGER, REAL, Row
 
+Columns = dict[str, NDArray[Any]]
+"""Column name -> its values, [N]: float64, in which NaN stands for no value, or a masked array of int64."""
 _MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
 """A value of a row as its bytes are, if there is one."""
+_VALUE = b"(?:N|[IR].{8})"
+"""Regular expression of a value's bytes."""
+
+
+class GrowingTable:
+    """Columns that grow by one row at a time."""
+
+    def __init__(self, columns: Sequence[Column]) -> None:
+        """An empty table with the names and types of `columns`."""
+        self._columns: list[tuple[str, array[Any], float]] = [
+            (column.name, array("q"), NO_INTEGER) if column.type == "INTEGER" else (column.name, array("d"), np.nan)
+            for column in columns
+        ]
+
+    def add(self, row: Row) -> None:
+        """Add a row; None stands for no value."""
+        for (_, values, nothing), value in zip(self._columns, row, strict=True):
+            values.append(nothing if value is None else value)
+
+    def columns(self, *, copy: bool = False) -> Columns:
+        """The columns by name. Unless they are copies, nothing can be added to the table afterwards."""
+        found = {name: np.array(values, copy=copy) for name, values, _ in self._columns}
+        return {
+            name: np.ma.MaskedArray(values, values == NO_INTEGER) if values.dtype.kind == "i" else values
+            for name, values in found.items()
+        }
 
 
 def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
-    """Bytes of rows with the same columns, such as the centres that one generation evaluated: those of `row_bytes` of
-    each, one after another. Values are converted as by `row_values`.
+    """Bytes of rows with the same columns, such as the centres that one generation evaluated. Values are converted as
+    by `codec.row_values`.
 
     A run of an older version may have fewer columns than the table, whose other columns are then left out.
 
@@ -59,62 +88,30 @@ def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
     return value_N_C.view(np.uint8).reshape(is_byte_N_C_9.shape)[is_byte_N_C_9].tobytes()
 
 
-def as_table(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> dict[str, NDArray[Any]]:
-    """Rows as a table, for `table_bytes`.
-
-    Raises:
-        StoreError: a row lacks a column, or a value has the wrong type.
-    """
-    names = {column.name for column in columns}
-    for row in rows:
-        if missing := names - row.keys():
-            raise StoreError(f"a row has the columns {sorted(row)}; it lacks {sorted(missing)}")
-    table: dict[str, NDArray[Any]] = {}
-    for column in columns if rows else ():
-        values = [stored_value(column, row[column.name]) for row in rows]
-        kind, none = ("f8", np.nan) if column.type == "REAL" else ("i8", NO_INTEGER)
-        table[column.name] = np.array([none if value is None else value for value in values], kind)
-    return table
-
-
 def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
-    """The rows that `table_bytes` encoded, with values in the order of `columns`.
-
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    values: list[int | float | None] = []
-    position = 0
-    try:
-        while position < len(payload):
-            mark = payload[position : position + 1]
-            if mark == b"N":
-                values.append(None)
-                position += 1
-            else:
-                kind = {b"I": INTEGER, b"R": REAL}[mark]
-                values.append(kind.unpack_from(payload, position)[1])
-                position += kind.size
-    except (KeyError, struct.error) as error:
-        raise ValueError(f"the evaluated centres are unreadable: {error!r}") from error
-    if columns and len(values) % len(columns):
-        raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
-    return [tuple(values[i : i + len(columns)]) for i in range(0, len(values), len(columns) or 1)]
+    """The rows that `table_bytes` encoded, with values in the order of `columns`. Raises ValueError if `payload` does
+    not consist of such rows."""
+    _require_rows(payload, len(columns))
+    values = [_value(stored) for stored in re.findall(_VALUE, payload, re.DOTALL)]
+    return [tuple(values[at : at + len(columns)]) for at in range(0, len(values), len(columns) or 1)]
 
 
 def leading_values(payload: bytes, count: int, columns: int) -> bytes:
-    """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each.
+    """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each. Raises
+    ValueError if `payload` does not consist of such rows."""
+    _require_rows(payload, columns)
+    rows = b"(%b{%d})%b{%d}" % (_VALUE, count, _VALUE, columns - count)
+    return b"".join(re.findall(rows, payload, re.DOTALL))
 
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    value = b"(?:N|[IR].{8})"
-    rows = re.compile(b"(%b{%d})%b{%d}" % (value, count, value, columns - count), re.DOTALL)
-    found, end = [], 0
-    while end < len(payload):
-        row = rows.match(payload, end)
-        if row is None:
-            raise ValueError(f"the evaluated centres are unreadable from byte {end} on")
-        found.append(row[1])
-        end = row.end()
-    return b"".join(found)
+
+def _require_rows(payload: bytes, columns: int) -> None:
+    rows = re.match(b"(?:%b{%d})*+" % (_VALUE, columns), payload, re.DOTALL)
+    if rows is None or rows.end() < len(payload):
+        at = 0 if rows is None else rows.end()
+        raise ValueError(f"the evaluated centres are unreadable from byte {at} on")
+
+
+def _value(stored: bytes) -> int | float | None:
+    if stored == b"N":
+        return None
+    return (INTEGER if stored[:1] == b"I" else REAL).unpack(stored)[1]

@@ -40,16 +40,9 @@ class Upkeep:
         notices: list[str],
     ) -> None:
         """Set the journal: WAL on a local disk; where that is impossible, and on a network file system, a synchronous
-        rollback journal.
-
-        Raises:
-            StoreError: SQLite keeps another journal on a network file system.
-        """
-        self._connection = connection
-        self._folder = folder
-        self._network = network
-        self._hook = hook
-        self._notices = notices
+        rollback journal. Raises StoreError if SQLite keeps another journal on a network file system."""
+        self._connection, self._folder, self._network = connection, folder, network
+        self._hook, self._notices = hook, notices
         self.copy_interval_s = NETWORK_COPY_INTERVAL_S if network else LOCAL_COPY_INTERVAL_S
         self._copied_at = time.monotonic() - _age_s(folder / COPY, self.copy_interval_s)
         self._copy_seconds = 0.0
@@ -58,14 +51,11 @@ class Upkeep:
         self._checkpointed_at = time.monotonic()
         wanted = "delete" if network else "wal"
         journal = connection.execute(f"PRAGMA journal_mode = {wanted}").fetchone()[0]
+        file = folder / DATABASE
         if network and journal != wanted:
-            raise StoreError(
-                f"{folder / DATABASE}: SQLite uses the journal {journal} instead of {wanted}, as it must here"
-            )
+            raise StoreError(f"{file}: SQLite uses the journal {journal} instead of {wanted}, as it must here")
         if journal != wanted:  # the run is safe with any other journal as well, but commits take longer
-            notices.append(
-                f"{folder / DATABASE}: SQLite cannot use a write-ahead log on this disk; its journal is {journal}"
-            )
+            notices.append(f"{file}: SQLite cannot use a write-ahead log on this disk; its journal is {journal}")
         connection.execute(f"PRAGMA synchronous = {'NORMAL' if journal == 'wal' else 'FULL'}")
         # This class makes the checkpoints, so that the cost of a commit is known and tests can kill it around them.
         connection.execute("PRAGMA wal_autocheckpoint = 0")

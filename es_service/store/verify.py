@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import sqlite3
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from es_service.store.certifications import Key, damaged_rows
+from es_service.store import certifications
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
-from es_service.store.folder import is_disk_full
+from es_service.store.folder import is_no_damage
 from es_service.store.platforms import sound_platforms
-from es_service.store.rows import KeptRows, history_rows, whole_states
+from es_service.store.rows import history_rows
 from es_service.store.schema import Damaged, RunMeta, load_meta, table_statements
+from es_service.store.states import KeptRows, whole_states
 
-_NOT_DAMAGE = {
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_NOMEM,
-    sqlite3.SQLITE_PERM,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_INTERRUPT,
-}
-"""SQLite errors that do not mean that the file is damaged, so the file must not be replaced because of them."""
 MOST_NAMED = 8
 """Most problems that a message names."""
 
@@ -39,11 +29,11 @@ class Verdict:
     """Newest generation whose whole state is intact, and the history up to it as well; None if there is none."""
     kept: KeptRows
     """Intact state rows."""
-    bad_rows: tuple[tuple[str, int], ...] = ()
+    bad_rows: tuple[tuple[str, int], ...]
     """Damaged state rows as (part, generation), which must be deleted."""
-    bad_certifications: tuple[Key, ...] = ()
-    """Damaged rows of the table of certified policies, which must be deleted as well."""
-    problems: tuple[str, ...] = field(default=())
+    bad_certifications: tuple[certifications.Key, ...]
+    """Damaged rows of the table of certified policies, which must be emptied."""
+    problems: tuple[str, ...]
     """All problems found, as messages for the user."""
 
     @property
@@ -53,32 +43,10 @@ class Verdict:
         return "; ".join([*self.problems[:MOST_NAMED], *more])
 
 
-def is_no_damage(error: BaseException, folder: Path) -> bool:
-    """Whether an error does not mean that the database in `folder` is damaged.
-
-    The database may have been busy or not accessible, or the disk too full for the files that SQLite writes beside it.
-    """
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    return isinstance(error, OSError) or code in _NOT_DAMAGE or is_disk_full(error, folder)
-
-
-def check_header(file: Path) -> None:
-    """Raise Damaged if the header of a database is wrong. No connection of this process may have the file open."""
-    with file.open("rb") as stream:
-        header = stream.read(100)
-    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
-        raise Damaged("it is not an SQLite database")
-    # Write and read version: 1 is a rollback journal, 2 is WAL. SQLite treats a file with others as read-only.
-    if header[18] != header[19] or header[18] not in (1, 2):
-        raise Damaged("its header names an unknown file format")
-
-
 def verify(connection: sqlite3.Connection, file: Path, known: int = 0) -> Verdict:
-    """Check everything in a database; this reads all of it once.
+    """Check everything in the database `file`; this reads all of it once.
 
     Args:
-        connection: connection to the database.
-        file: path of the database.
         known: number of history rows, from generation 0 on, that are known to be intact. They are not checked again,
             except the last two.
 
@@ -121,11 +89,9 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         lost = 0 if good is None else good + 1
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
-    bad_certifications = damaged_rows(connection)
-    problems += [
-        f"row {rank} of certification {number} does not match its SHA-256" for number, rank in bad_certifications
-    ]
-    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certifications), tuple(problems))
+    bad_certified = [key for key, row in certifications.rows(connection) if row is None]
+    problems += [f"row {rank} of certification {number} does not match its SHA-256" for number, rank in bad_certified]
+    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certified), tuple(problems))
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:
@@ -136,9 +102,8 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
         is_there = row.generation == count
         if not (is_there and is_sound):
             bad.append(count)
-            problems.append(
-                f"history row of generation {count} {'does not match its SHA-256' if is_there else 'is missing'}"
-            )
+            what = "does not match its SHA-256" if is_there else "is missing"
+            problems.append(f"history row of generation {count} {what}")
         count += 1
         if not is_there:
             break

@@ -12,7 +12,6 @@ import contextlib
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from numpy.typing import NDArray
@@ -20,25 +19,21 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
-from es_service.store.certifications import encoded, next_number
-from es_service.store.codec import Part, column_bytes, encode_changes, history_row, row_dict, rows_listed, state_sha256
+from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.kept import KeptStates
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
-from es_service.store.rows import history_rows, sound_part
-from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta, history_insert
+from es_service.store.rows import history_rows, insert_history
+from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta
+from es_service.store.states import KeptStates, insert_state, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
-Values = Mapping[str, int | float | None]
-"""One history row: column name -> value; NaN or None stands for no value."""
 _LOG = logger(__name__)
-RECENT_BYTES = 128 * 2**20
-"""Most bytes of parts that are kept decoded: elites of which new policies descend are read again and again."""
 NO_ROWS: Table = {}
 NOTHING = Beginning()
 """Beginning of an ordinary run."""
@@ -63,26 +58,25 @@ class RunStore:
     """Arrays from which generation 0 starts; None if the run was created without them."""
 
     def __init__(self, folder: Path, lock: RunLock, hook: Callable[[str], None]) -> None:
-        """Open the run in `folder`, whose lock is held. Use `create` or `open` instead."""
+        """Open the run in `folder`, whose lock is held and released at the end. Use `create` or `open` instead."""
         self.folder = folder
         self.notices = []
         self.lock = lock
         self._hook = hook
         self._closed = self._recorded = False
-        self._connection, verdict = open_sound(folder, self.notices)
-        self.meta = verdict.meta
-        self.generation = verdict.good
-        self._insert_history = history_insert(self.meta.columns)
-        self._heading = column_bytes(self.meta.columns)
-        try:
+        with contextlib.ExitStack() as closing:
+            closing.callback(lock.release)
+            self._connection, verdict = open_sound(folder, self.notices)
+            closing.callback(self._connection.close)
+            self.meta = verdict.meta
+            self.generation = verdict.good
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
                 self._kept = KeptStates(self._connection, verdict.kept, verdict.good)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
-        except BaseException:
-            self._connection.close()
-            raise
+            closing.callback(self.upkeep.finish)
+            self._closing = closing.pop_all()
 
     @classmethod
     def create(
@@ -98,8 +92,6 @@ class RunStore:
 
         Args:
             folder: path that does not exist, or an empty folder; missing parents are created.
-            config_yaml: text of `config.yaml`.
-            meta: description of the run.
             beginning: data with which the run begins; no run folder appears without them.
             hook: function that is called with the name of each step, for tests.
 
@@ -107,8 +99,7 @@ class RunStore:
             StoreError: the folder is not empty or cannot be written, or the columns of `meta` cannot be stored.
         """
         folder = Path(folder)
-        lock = create_run_folder(folder, config_yaml, meta, beginning)
-        return cls._holding(lock, folder, hook)
+        return cls(folder, create_run_folder(folder, config_yaml, meta, beginning), hook)
 
     @classmethod
     def open(cls, folder: Path, *, hook: Callable[[str], None] = no_hook) -> RunStore:
@@ -123,24 +114,13 @@ class RunStore:
             require_run_folder(folder)
         except OSError as error:
             raise explained(error, folder, "looking for a run") from error
-        return cls._holding(acquire_lock(folder), folder, hook)
-
-    @classmethod
-    def _holding(cls, lock: RunLock, folder: Path, hook: Callable[[str], None]) -> RunStore:
-        try:
-            return cls(folder, lock, hook)
-        except BaseException:
-            lock.release()
-            raise
+        return cls(folder, acquire_lock(folder), hook)
 
     def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
-        """State of the newest generation: part -> name -> array; empty before the first commit.
+        """State of the newest generation: part -> name -> array; empty before the first commit. Raises as `part`.
 
         Args:
             without: prefix of the names of parts that are left out; None to load all parts.
-
-        Raises:
-            StoreError: a part has been damaged since the run was opened.
         """
         names = self._kept.names()
         return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
@@ -184,19 +164,15 @@ class RunStore:
         new = rows_listed(rows)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
         total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
-        history_values = history_row(
-            self.meta.columns, self._heading, generation, history, centres, state_sha256(total)
-        )
         self._hook("before_begin")
-        with self._transaction(f"storing generation {generation}") as execute:
+        with self._transaction(f"storing generation {generation}") as connection:
             # Delete first, so that the new rows use the pages of the old ones.
-            self._connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
-            insert = "INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)"
-            self._connection.executemany(insert, rows)
+            connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
+            insert_state(connection, rows)
             self._hook("mid_transaction")
-            execute(self._insert_history, history_values)
+            insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
             if self._recorded:
-                store_list(execute)
+                store_list(connection)
             self._hook("before_commit")
         self._recorded = False
         self.generation = generation
@@ -214,65 +190,50 @@ class RunStore:
         return row_dict(self.meta.columns, newest.row)
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
-        """Record the platform of a generation that is not stored yet, and of those after it.
+        """Record the platform of a generation that is not stored yet, and of those after it, in place of their records.
 
-        This replaces the records of `generation` and later. Nothing is recorded if the platform is the same as before.
-        Returns whether it differs from that of the generations before, or is the first.
-
-        Raises:
-            StoreError: `generation` is already stored.
+        Returns whether it differs from that of the generations before, or is the first; otherwise nothing is recorded.
+        Raises StoreError if `generation` is already stored.
         """
         if self.generation is not None and generation <= self.generation:
             raise StoreError(
                 f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
-        with self._transaction("recording the platform") as execute:
+        with self._transaction("recording the platform") as connection:
             self._recorded = True
-            return record(execute, generation, platform)
+            return record(connection, generation, platform)
 
     @property
     def next_certification(self) -> int:
         """Number of the next certification."""
         with self._explaining("reading the certifications"):
-            return next_number(self._connection, self.meta.parent)
+            return certifications.next_number(self._connection, self.meta.parent)
 
     def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
-        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
-
-        Raises:
-            StoreError: the disk is full, or the database cannot be written.
-        """
-        rows = encoded(self.next_certification, policies)
-        with self._transaction("storing a certification") as execute:
-            for row in rows:
-                execute("INSERT INTO certification (number, rank, facts, payload, sha256) VALUES (?, ?, ?, ?, ?)", row)
-        self.upkeep.after_commit(sum(len(row[3]) for row in rows) + PAGE_BYTES)
+        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank. Raises
+        StoreError if the database cannot be written."""
+        number = self.next_certification
+        with self._transaction("storing a certification") as connection:
+            size = certifications.insert(connection, number, policies)
+        self.upkeep.after_commit(size + PAGE_BYTES)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""
         with self._explaining("reading the platforms"):
-            return newest_before(self._connection.execute, generation)
+            return newest_before(self._connection, generation)
 
     def close(self) -> None:
         """Make `run.db` a single file and release the lock. This may be called again.
 
         If a reader still uses the database or the disk is full, SQLite's log remains beside it, and nothing is lost.
         """
-        if self._closed:
-            return
         self._closed = True
-        try:
-            self.upkeep.finish()
-        finally:
-            self._connection.close()
-            self.lock.release()
+        self._closing.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     @contextlib.contextmanager
@@ -285,14 +246,7 @@ class RunStore:
             raise explained(error, self.folder, doing) from error
 
     @contextlib.contextmanager
-    def _transaction(self, doing: str) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        with self._explaining(doing):
-            try:
-                self._connection.execute("BEGIN IMMEDIATE")
-                yield self._connection.execute
-                self._connection.execute("COMMIT")
-            except BaseException:
-                # After some errors, SQLite has already rolled back.
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
-                raise
+    def _transaction(self, doing: str) -> Iterator[sqlite3.Connection]:
+        with self._explaining(doing), self._connection as connection:  # which commits, or rolls back
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from es_service.loop.history import Column
+from es_service.loop.history import NO_INTEGER, Column
 from es_service.store import upkeep as store_upkeep
 from es_service.store.connection import reading
 from es_service.store.digest import digest_of, digest_parts
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_evaluations, read_history, read_parts
 from es_service.store.schema import Damaged
-from es_service.store.tables import as_table
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
 
@@ -103,6 +102,17 @@ def evaluated(generation):
         }
         for centre in centres
     ]
+
+
+def as_table(columns, rows):
+    """Rows as columns; None or NaN stands for no value."""
+    kinds = {"INTEGER": (np.int64, NO_INTEGER), "REAL": (np.float64, math.nan)}
+    table = {}
+    for column in columns if rows else ():
+        kind, none = kinds[column.type]
+        values = [row[column.name] for row in rows]
+        table[column.name] = np.array([none if value is None or value != value else value for value in values], kind)
+    return table
 
 
 def evaluated_table(generation):

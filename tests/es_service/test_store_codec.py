@@ -15,8 +15,8 @@ from es_service.store.codec import (
     state_sha256,
     state_sum,
 )
-from es_service.store.tables import as_table, leading_values, table_bytes
-from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
+from es_service.store.tables import leading_values, table_bytes
+from tests.es_service.store_examples import COLUMNS, as_table, assert_same_state, history_row
 
 ARRAYS = {
     "float32": np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4),
