@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tests.benchmarks import paper, paper_tables
+from tests.benchmarks import certified, paper, paper_tables
 from tests.benchmarks.paper_readings import AT, CURVE_AT, READINGS, column, curve, measured, readings
 
 
@@ -125,20 +125,39 @@ def test_each_wanted_run_is_made_once_and_only_the_folder_of_a_finished_one_goes
 
     def run_one(one):
         (tmp_path / one.name).mkdir()
-        return paper.Computed({"seed": one.seed, "finished": one.seed % 2 == 0}, pd.DataFrame())
+        return one.seed
 
-    monkeypatch.setattr(paper, "RUNS", tmp_path)
-    monkeypatch.setattr(paper, "run_one", run_one)
+    def keep(seed):
+        seeds.append(seed)
+        return seed % 2 == 0
+
     monkeypatch.setattr(paper, "worker_environment", dict)
     monkeypatch.setattr(paper, "ProcessPoolExecutor", lambda workers, **_: ThreadPoolExecutor(workers))
-    wanted, before, rows = (
-        [paper.Wanted(Path("c.yaml"), seed, 1) for seed in range(5)],
-        signal.getsignal(signal.SIGINT),
-        [],
-    )
+    wanted, before = [paper.Wanted(Path("c.yaml"), seed, 1) for seed in range(5)], signal.getsignal(signal.SIGINT)
+    seeds: list[int] = []
     try:
-        paper.compute(wanted, rows.append)
+        paper.compute(wanted, run_one, keep, tmp_path)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert sorted(computed.row["seed"] for computed in rows) == list(range(5))
+    assert sorted(seeds) == list(range(5))
     assert sorted(folder.name for folder in tmp_path.iterdir()) == ["c_1", "c_3"]
+
+
+def test_certified_rows_replace_those_of_the_same_run_and_the_median_is_over_seeds_at_their_first_row_from_a_mark(
+    tmp_path,
+):
+    path = tmp_path / "certified.csv"
+
+    def rows(seed, *at):
+        of_run = {"task": "ant_trap", "method": "es", "settings": "ant_trap_es", "seed": seed, "seconds": 1}
+        marks = [{**of_run, "env_steps": steps, "return_mean": value, "successes": 0} for steps, value in at]
+        return pd.DataFrame(marks)
+
+    for seed, value in ((0, 10.0), (1, 30.0), (2, 20.0)):
+        certified.keep(path, rows(seed, (10**7 + 1, value), (10**8 + 1, 2000.0)))
+    certified.keep(path, rows(1, (10**7 + 5, 50.0)))
+    table = certified.read(path)
+    assert list(table.seed) == [0, 0, 1, 2, 2]
+    assert "**20** (10 to 50, 3 seeds) | **2,000** (2,000 to 2,000, 2 seeds) |" in certified.in_words(table)
+    wanted = [certified.Wanted(Path("ant_trap_es.yaml"), seed, (10**7, 10**8)) for seed in range(4)]
+    assert [one.seed for one in certified.missing(wanted, table)] == [1, 3]
