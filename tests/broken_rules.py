@@ -364,7 +364,7 @@ CASES = [
         (
             "an item is behind another one after a loss",
             "es_service/dispatch/assignment.py",
-            "1 if s.limits.items_overlap and s.losses_in_a_row else s.limits.in_flight",
+            "1 if s.limits.items_at_once > 1 and s.losses_in_a_row else s.limits.in_flight",
             "s.limits.in_flight",
         ),
     ),

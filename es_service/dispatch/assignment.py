@@ -17,7 +17,7 @@ from es_service.dispatch.scheduler_state import SchedulerState, Slot, Waiting
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> None:
     """Assign queued items to workers that can take more, idle workers first."""
-    for load in range(1 if s.limits.items_overlap and s.losses_in_a_row else s.limits.in_flight):
+    for load in range(1 if s.limits.items_at_once > 1 and s.losses_in_a_row else s.limits.in_flight):
         passed = 0
         while s.places and passed < len(s.free):
             slots, _, _, worker = s.free[passed]

@@ -86,6 +86,11 @@ class Limits:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
 
+    @property
+    def items_at_once(self) -> int:
+        """Work items that a worker computes side by side."""
+        return self.in_flight if self.items_overlap and self.cores > 1 else 1
+
 
 def key_of(limit: str) -> str:
     """What a user can change of a field of `Limits`, for messages: a key of the config."""

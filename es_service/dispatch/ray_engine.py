@@ -75,8 +75,9 @@ def ray_engine(
     try:
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, grows=grows, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        at_once = limits.in_flight if limits.items_overlap and claim.cpus > 1 else 1
-        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, at_once)
+        transport = Actors(
+            ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, items_at_once=limits.items_at_once
+        )
         on_wait = (lambda shortage: None) if watch is None else on_wait
         return Engine(transport, limits, should_stop, log, on_wait, on_compile)
     except BaseException:

@@ -25,7 +25,7 @@ from es_service.cli.sweep import seeds_of
 from es_service.protocol.machine import cpu_kind
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import certified_policies
-from tests.benchmarks.paper import commit, compute
+from tests.benchmarks.paper import commit, compute, folder_name
 from tests.helpers import workers_in_this_process
 
 ROOT = Path(__file__).parents[2]
@@ -68,7 +68,7 @@ class Wanted(NamedTuple):
     @property
     def name(self) -> str:
         """Of its folder."""
-        return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
+        return folder_name(self.config, self.seed, self.settings)
 
 
 def run_one(wanted: Wanted) -> pd.DataFrame:

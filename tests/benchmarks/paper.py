@@ -61,7 +61,12 @@ class Wanted(NamedTuple):
     @property
     def name(self) -> str:
         """Of its folder."""
-        return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
+        return folder_name(self.config, self.seed, self.settings)
+
+
+def folder_name(config: Path, seed: int, settings: Sequence[str]) -> str:
+    """Name of the folder of a run."""
+    return "_".join([config.stem, str(seed), *settings]).replace("/", "_")
 
 
 class NamedRun(Protocol):

@@ -69,7 +69,7 @@ def test_what_a_bystander_was_computing_is_not_to_blame():
 
 def test_where_items_overlap_the_one_that_loses_workers_is_named_and_not_the_one_before_it():
     """One worker, which begins `p` while it still computes `a`: `p` ends its process each time."""
-    state, _ = play(ready(1, items_overlap=True), (1.0, items("apz")), (2.0, WorkerLost(0, "killed")))
+    state, _ = play(ready(1, items_overlap=True, cores=2), (1.0, items("apz")), (2.0, WorkerLost(0, "killed")))
     state, commands = play(state, (3.0, WorkerUp(1)))
     assert commands == [Assign(1, "a", 2)], "`p` waits, or it would be the loss of `a` again"
     state, commands = step(state, Result(1, "a", 2), 4.0)
