@@ -153,12 +153,12 @@ class AskTell:
         steps_N = np.ones(count, np.int32) if steps is None else _array("steps", steps, (count,)).astype(np.int32)
         if (steps_N < 1).any():
             raise ConfigError(f"steps has {steps_N.min()}; must be at least 1", field="steps", allowed="at least 1")
-        found = Moments(0.0, np.zeros(size), np.zeros(size))
+        observed = Moments(0.0, np.zeros(size), np.zeros(size))
         if moments is not None:
-            mean_O, m2_O = (_array("moments", one, (size,)).astype(np.float64) for one in moments[1:])
-            found = Moments(float(moments[0]), mean_O, m2_O)
+            mean_O, m2_O = (_array("moments", moment, (size,)).astype(np.float64) for moment in moments[1:])
+            observed = Moments(float(moments[0]), mean_O, m2_O)
         self._asked = None
-        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N, found))
+        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N, observed))
         self._receive()
 
     def _receive(self) -> None:

@@ -33,9 +33,9 @@ _CONTEXT = _Context()
 
 def logger(name: str) -> logging.Logger:
     """The logger of a module of es_service, `logger(__name__)`."""
-    found = logging.getLogger(name)
-    found.addFilter(_CONTEXT)
-    return found
+    module_logger = logging.getLogger(name)
+    module_logger.addFilter(_CONTEXT)
+    return module_logger
 
 
 @contextmanager

@@ -200,8 +200,8 @@ CASES = [
         (
             "of another centre of the same generation",
             STARTS,
-            "one.generation_N * centres + one.centre_N",
-            "one.generation_N * centres",
+            "entries.generation_N * centres + entries.centre_N",
+            "entries.generation_N * centres",
         ),
     ),
     *cases(

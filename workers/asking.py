@@ -51,7 +51,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Told:
-    """What the caller has computed."""
+    """Results of the caller."""
 
     fitness_N: FloatArray
     descriptor_N_B: FloatArray
@@ -64,7 +64,12 @@ def gradients(spec: WorkerSpec, work: Sequence[Work]) -> list[ChunkResult]:
     """Results of gradient chunks, which need no episodes."""
     kind = _kinds(spec)[GradientChunk]
     return with_neighbours_added(
-        work, [result for one in work for result in kind.results([one], kind.function(*kind.arguments([one])))]
+        work,
+        [
+            result
+            for subject_chunk in work
+            for result in kind.results([subject_chunk], kind.function(*kind.arguments([subject_chunk])))
+        ],
     )
 
 
@@ -86,7 +91,7 @@ def rows_of(spec: WorkerSpec, work: Sequence[Work]) -> Rows:
 
 def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[ChunkResult]:
     """Results of the chunks of which `rows_of` has made rows."""
-    kinds, found, first = _kinds(spec), [], 0
+    kinds, results, first = _kinds(spec), [], 0
     for subject, chunk in work:
         arguments = kinds[type(chunk)].arguments([(subject, chunk)])
         if isinstance(chunk, TrainingChunk):
@@ -97,8 +102,8 @@ def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[Chunk
             is_told = np.ones(len(arguments[4]), bool)
         rows = slice(first, first := first + int(is_told.sum()))
         episodes = _episodes(spec, told, rows, is_told, isinstance(chunk, TrainingChunk))
-        found += kinds[type(chunk)].results([(subject, chunk)], episodes)
-    return _with_moments(found, told.moments)
+        results += kinds[type(chunk)].results([(subject, chunk)], episodes)
+    return _with_moments(results, told.moments)
 
 
 def _with_moments(results: list[ChunkResult], moments: Moments) -> list[ChunkResult]:
@@ -136,7 +141,7 @@ def _quiet(parameters: Any, mean: Any, std: Any, keys_N_4: Any) -> tuple[Any, ..
 
 
 def _episodes(spec: WorkerSpec, told: Told, rows: slice, is_told: Any, training: bool) -> Episodes:
-    """What a rollout would have computed; the observations are told as moments, so that their sums are 0."""
+    """Episodes as from a rollout; the observations are told as moments, so that their sums are 0."""
     descriptor = np.zeros((*is_told.shape, told.descriptor_N_B.shape[1]), np.float32)
     fitness, steps = np.zeros(is_told.shape, np.float32), np.zeros(is_told.shape, np.int32)
     fitness[is_told], steps[is_told], descriptor[is_told] = (

@@ -28,7 +28,7 @@ class Compilable:
 
 
 def jitted(function: Callable[..., Any]) -> Compilable:
-    """The function compiled by XLA, once for each shape of its arguments. What `compile` made is what a call runs."""
+    """The function compiled by XLA, once for each shape of its arguments. A call runs what `compile` made."""
     import jax  # here, since a worker without JAX tasks does not load it
 
     run = jax.jit(function)

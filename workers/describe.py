@@ -32,8 +32,8 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
         TaskError: the task does not exist or cannot be used.
     """
     task = describe_environment(name, settings)
-    able = {name: one for name, one in BACKENDS.items() if task.kind in one.task_kinds}
-    reasons = {name: why for name, one in able.items() if (why := one.examine(task))}
+    able = {name: backend for name, backend in BACKENDS.items() if task.kind in backend.task_kinds}
+    reasons = {name: why for name, backend in able.items() if (why := backend.examine(task))}
     return dataclasses.replace(task, unsupported=reasons)
 
 

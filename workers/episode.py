@@ -80,7 +80,7 @@ def episode_steps(
             shifted_sum_O=sums_O,
             shifted_square_sum_O=sums_O,
             trace_T_B=trace_T_B,
-            outputs={name: one.begin(environment, state, zeros_A) for name, one in named.items()},
+            outputs={name: output.begin(environment, state, zeros_A) for name, output in named.items()},
             of_steps={},
         )
         return Carry(state, jnp.array(True), initial_memory(jnp, spec.policy), nothing)
@@ -121,7 +121,7 @@ def episode_steps(
             shifted_sum_O=before.shifted_sum_O + shifted_O,
             shifted_square_sum_O=before.shifted_square_sum_O + shifted_O * shifted_O,
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
-            outputs={name: one.after(environment, step, before.outputs[name]) for name, one in named.items()},
+            outputs={name: output.after(environment, step, before.outputs[name]) for name, output in named.items()},
             of_steps={},
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)

@@ -1,4 +1,4 @@
-"""What a worker says of its GPU."""
+"""Platform of a worker with a GPU."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Outputs of episodes that are computed only if a run names them, besides those that every result has.
 
-`es_service/protocol/outputs.py` has their names. Adding one touches the names, this file, and the method that reads it.
+`es_service/protocol/outputs.py` has their names. A new output touches names, this file, and the method that reads it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def named_outputs(names: Sequence[str]) -> dict[str, Output]:
 
 
 def _of_state(value: Callable[[Environment, Any], Any]) -> Output:
-    """What is known of a state alone."""
+    """An output of the state alone."""
     return Output(
         lambda environment, state, _: value(environment, state),
         lambda environment, step, _: value(environment, step.state),

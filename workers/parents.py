@@ -18,7 +18,7 @@ class Parents:
 
         Args:
             most_bytes: as in `KeptParents`.
-            made: `Recipes.made`, or what has its bits.
+            made: `Recipes.made`, or its equal in bits.
         """
         self.kept: KeptParents[FloatArray] = KeptParents(most_bytes, attrgetter("nbytes"))
         self._made = made
@@ -28,9 +28,9 @@ class Parents:
         waiting: dict[bytes, Origin] = {}  # they are made together, since a call takes longer than a small policy
         for name, given in parents.items():
             if isinstance(given, Origin):
-                if not all(one in self.kept for one in (given.x, given.y)) or not _same_rule(given, waiting):
+                if not all(parent in self.kept for parent in (given.x, given.y)) or not _same_rule(given, waiting):
                     self._make(waiting)
-                if all(one in self.kept for one in (given.x, given.y)):
+                if all(parent in self.kept for parent in (given.x, given.y)):
                     waiting[name] = given
             else:
                 self._make(waiting)
@@ -51,4 +51,4 @@ class Parents:
 
 
 def _same_rule(origin: Origin, others: Mapping[bytes, Origin]) -> bool:
-    return all(origin.rule == one.rule for one in others.values())
+    return all(origin.rule == other.rule for other in others.values())

@@ -58,8 +58,8 @@ def _outputs(equation: Any, inputs: list[Any]) -> Sequence[Any]:
     if name.startswith("scatter") and _drops(params):
         return [_with_a_place_for_the_dropped(equation, *inputs)]
     inner = {name: _without(value) for name, value in params.items() if _has_jaxprs(value)}  # of a loop or a branch
-    found = equation.primitive.bind(*inputs, **params | inner)
-    return found if equation.primitive.multiple_results else [found]
+    outputs = equation.primitive.bind(*inputs, **params | inner)
+    return outputs if equation.primitive.multiple_results else [outputs]
 
 
 def _has_jaxprs(value: Any) -> bool:
@@ -102,10 +102,10 @@ def _drops(params: dict[str, Any]) -> bool:
 
 
 def _with_a_place_for_the_dropped(equation: Any, operand: Any, indices: Any, updates: Any) -> Any:
-    """The scatter into an operand that is longer by one along each axis of the indices, where the dropped ones go."""
+    """The scatter into an operand that is longer by one along each axis of the indices, for the dropped updates."""
     axes = equation.params["dimension_numbers"].scatter_dims_to_operand_dims
     sizes = jnp.asarray([operand.shape[axis] for axis in axes], indices.dtype)
     is_kept = ((indices >= 0) & (indices < sizes)).all(axis=-1, keepdims=True)
     longer = jnp.pad(operand, [(0, int(axis in axes)) for axis in range(operand.ndim)])
-    found = equation.primitive.bind(longer, jnp.where(is_kept, indices, sizes), updates, **equation.params)
-    return found[tuple(slice(size) for size in operand.shape)]
+    scattered = equation.primitive.bind(longer, jnp.where(is_kept, indices, sizes), updates, **equation.params)
+    return scattered[tuple(slice(size) for size in operand.shape)]

@@ -14,7 +14,7 @@ HIDDEN_GROUP = 3
 
 
 class Viewer(NamedTuple):
-    """What a replay in three dimensions needs of a task."""
+    """Data of a task for replays in three dimensions."""
 
     model: Any
     """The MuJoCo model (`mj_model` of a Brax system)."""

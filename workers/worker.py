@@ -81,7 +81,9 @@ def make_worker(spec: WorkerSpec) -> Compilable:
                     f"raised in {place if lane is None else f'{lane_name(spec, work[0], lane)}, in {place}'}"
                 )
                 raise
-        return [result for one in work for result in named(function, [one])]  # to find the one that raises
+        return [
+            result for subject_chunk in work for result in named(function, [subject_chunk])
+        ]  # to find which chunk raises
 
     def run(work: Sequence[Work]) -> list[ChunkResult]:
         return with_neighbours_added(work, [result for group in groups(work) for result in named(run_group, group)])
@@ -109,7 +111,9 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
     def training_results(work: Sequence[tuple[Centre, TrainingChunk]], episodes: Episodes) -> list[ChunkResult]:
         shift_O = work[0][0].observation_mean_O
         parts = zip(work, _split(episodes, spec.chunk_pairs), strict=True)
-        return [_with_failures(spec, one, part, training_result(part, shift_O)) for one, part in parts]
+        return [
+            _with_failures(spec, subject_chunk, part, training_result(part, shift_O)) for subject_chunk, part in parts
+        ]
 
     def evaluation_arguments(work: Sequence[tuple[Centre, EvaluationChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
@@ -125,8 +129,10 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
     def evaluation_results(work: Sequence[tuple[Centre, EvaluationChunk]], episodes: Episodes) -> list[ChunkResult]:
         parts = _split(episodes, EVALUATION_EPISODES_PER_CHUNK)
         return [
-            _with_failures(spec, one, part, evaluation_result(part, one[1].episodes, one[1].first))
-            for part, one in zip(parts, work, strict=True)
+            _with_failures(
+                spec, subject_chunk, part, evaluation_result(part, subject_chunk[1].episodes, subject_chunk[1].first)
+            )
+            for part, subject_chunk in zip(parts, work, strict=True)
         ]
 
     def gradient_arguments(work: Sequence[tuple[Centre, GradientChunk]]) -> tuple[Any, ...]:
@@ -161,20 +167,24 @@ def _wanted(chunk: EvaluationChunk) -> Any:
 
 def _policy_arguments(spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
     policies, chunk = work[0]
-    together = list({id(one): one for one, _ in work}.values())
-    ends = accumulate(len(one.parameters_N_D) for one in together)
+    together = list({id(subject): subject for subject, _ in work}.values())
+    ends = accumulate(len(subject.parameters_N_D) for subject in together)
     first_row = dict(zip(map(id, together), [0, *ends], strict=False))
-    slots_C = [slots(*one) for one in work]
+    slots_C = [slots(*subject_chunk) for subject_chunk in work]
     row_L = np.concatenate(
-        [first_row[id(one)] + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)]
+        [first_row[id(subject)] + policy_L for (subject, _), (policy_L, _) in zip(work, slots_C, strict=True)]
     )
-    number_L = np.concatenate([one.first + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)])
+    number_L = np.concatenate(
+        [subject.first + policy_L for (subject, _), (policy_L, _) in zip(work, slots_C, strict=True)]
+    )
     episode_L = np.concatenate([episode_L for _, episode_L in slots_C])
     inputs = spec.policy.widths[0]
     return (
-        [one.parameters_N_D for one in together],
-        np.concatenate([_statistics(one, one.observation_mean_N_O, 0.0, inputs) for one in together])[row_L],
-        np.concatenate([_statistics(one, one.observation_std_N_O, 1.0, inputs) for one in together])[row_L],
+        [subject.parameters_N_D for subject in together],
+        np.concatenate([_statistics(subject, subject.observation_mean_N_O, 0.0, inputs) for subject in together])[
+            row_L
+        ],
+        np.concatenate([_statistics(subject, subject.observation_std_N_O, 1.0, inputs) for subject in together])[row_L],
         row_L,
         evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L, policies.domain),
     )
@@ -191,12 +201,12 @@ def _policy_results(
     spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]], episodes: Episodes
 ) -> list[ChunkResult]:
     results, start = [], 0
-    for one, chunk in work:
-        _, episode_L = slots(one, chunk)
+    for subject, chunk in work:
+        _, episode_L = slots(subject, chunk)
         of_chunk = slice(start, start + len(episode_L))
         part = episodes.map(lambda array, of=of_chunk: array[of])
-        result = policies_result(part, episode_L == 0 if one.traces else None)
-        results.append(_with_failures(spec, (one, chunk), part, result))
+        result = policies_result(part, episode_L == 0 if subject.traces else None)
+        results.append(_with_failures(spec, (subject, chunk), part, result))
         start += len(episode_L)
     return results
 
@@ -247,7 +257,7 @@ def _slots(work: Sequence[Work]) -> int:
 
 
 def _shared_by(subject: Subject) -> tuple[str, int, int]:
-    """What chunks that run together share: the centre, or the seed and the domain of the policies' resets."""
+    """Common part of chunks that run together: the centre, or the seed and the domain of the policies' resets."""
     if isinstance(subject, Policies):
         return "policies", subject.seed, subject.domain
     return "centre", id(subject), 0
@@ -272,7 +282,7 @@ def _split(episodes: Episodes, size: int) -> list[Episodes]:
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:
-    """What a population adds to the addresses of its random streams: nothing for the first of a generation."""
+    """Ids of a population in the addresses of its random streams: none for the first of a generation."""
     return (chunk.ask,) if chunk.ask else ()
 
 

@@ -46,7 +46,8 @@ def rollouts(
     rollouts = rollout.split(",") if rollout else []
     if policies is None:
         raise ConfigError(f"--policy {policy}: must be on or off")
-    able = [name for name, one in measured.ROLLOUTS.items() if one.task_kinds != (CALLER,)]  # others compute nothing
+    # Rollouts of a caller's tasks compute nothing.
+    able = [name for name, candidate in measured.ROLLOUTS.items() if candidate.task_kinds != (CALLER,)]
     if not set(rollouts) <= set(able):
         raise ConfigError(f"--rollout {rollout}: must be {one_of(able)}, or several separated by commas")
     if odd := [number for number in batch or () if number % 2]:

@@ -52,7 +52,7 @@ def bench_rollouts(
     every = sorted({1, cores()})
     for task in tasks or TASKS:
         cannot: set[str] = set()
-        asked = rollouts or [name for name, one in ROLLOUTS.items() if TASKS[task].kind in one.task_kinds]
+        asked = rollouts or [name for name, candidate in ROLLOUTS.items() if TASKS[task].kind in candidate.task_kinds]
         for policy, rollout in itertools.product(policies, asked):
             if rollout in cannot:
                 continue
@@ -78,7 +78,7 @@ def bench_rollouts(
 def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
     environment = child_environment()
-    found = []
+    measurements = []
     with ExitStack() as ends:
         started = []
         for _ in range(count):
@@ -92,17 +92,17 @@ def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
             printed, errors = process.communicate()
             if process.returncode:
                 raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
-            found.append(json.loads(printed.splitlines()[-1]))
+            measurements.append(json.loads(printed.splitlines()[-1]))
     named = {"task": arguments["task"], "rollout": arguments["rollout"]}
-    if "problem" in found[0]:
-        return named | {"note": f"{arguments['rollout']} cannot run it: {found[0]['problem']}"}
+    if "problem" in measurements[0]:
+        return named | {"note": f"{arguments['rollout']} cannot run it: {measurements[0]['problem']}"}
     return named | {
         "policy": "on" if arguments["policy"] else "off",
         "batch": arguments["batch"],
         "cores": count,
-        "steps_per_second": sum(one["steps_per_second"] for one in found),
-        "compile_seconds": max(one["compile_seconds"] for one in found),
-        "peak_mib": max(one["peak_mib"] for one in found),
+        "steps_per_second": sum(measurement["steps_per_second"] for measurement in measurements),
+        "compile_seconds": max(measurement["compile_seconds"] for measurement in measurements),
+        "peak_mib": max(measurement["peak_mib"] for measurement in measurements),
     }
 
 
@@ -121,4 +121,6 @@ def line(row: Mapping[str, Any]) -> str:
     shown = (row["task"], row["policy"], row["rollout"], row["batch"], row["cores"], f"{row['steps_per_second']:,}",
              row["compile_seconds"], row["peak_mib"], paper)  # fmt: skip
     widths = COLUMNS.values()
-    return "".join(f"{one!s:{'<' if width < 0 else '>'}{abs(width)}}" for one, width in zip(shown, widths, strict=True))
+    return "".join(
+        f"{value!s:{'<' if width < 0 else '>'}{abs(width)}}" for value, width in zip(shown, widths, strict=True)
+    )

@@ -25,11 +25,11 @@ def certified_rows(
     tell = partial(print_notice, errors)
 
     def rows_of(folder: Path) -> list[dict[str, Any]]:
-        found = certify_run(folder, on_notice=tell, **asked)
+        certified = certify_run(folder, on_notice=tell, **asked)
         if not as_json:
-            print_line(console, f"{folder}: certification {found[0].number}")
-            print_certified(console, found)
-        return [one.row() for one in found]
+            print_line(console, f"{folder}: certification {certified[0].number}")
+            print_certified(console, certified)
+        return [policy.row() for policy in certified]
 
     if is_single(folders):
         return rows_of(folders[0])

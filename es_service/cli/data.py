@@ -64,7 +64,7 @@ def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
 def _finite(value: Any) -> Any:
     """The value with null for each number that JSON does not have."""
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -45,7 +45,7 @@ SIGMA = 0.02
 def examine(*, as_json: bool = False) -> bool:
     """Print every finding, at once or as JSON at the end, and return whether no check failed."""
     checks = (_software, _ray, _machine, _vectors, _disk, _noise, _rollout)
-    return print_findings((one for check in checks for one in _guarded(check)), as_json=as_json)
+    return print_findings((finding for check in checks for finding in _guarded(check)), as_json=as_json)
 
 
 def examine_cluster(address: str, *, as_json: bool = False) -> bool:
@@ -55,14 +55,14 @@ def examine_cluster(address: str, *, as_json: bool = False) -> bool:
 
 def print_findings(findings: Iterator[Finding], *, as_json: bool) -> bool:
     """Print each finding when it is there, or all as JSON at the end; return whether no check failed."""
-    found: list[Finding] = []
+    listed: list[Finding] = []
     for level, text in findings:
-        found.append((level, text))
+        listed.append((level, text))
         if not as_json:
             print_finding(level, text)
     if as_json:
-        print_json([{"level": level, "text": text} for level, text in found])
-    return all(level != "FAIL" for level, _ in found)
+        print_json([{"level": level, "text": text} for level, text in listed])
+    return all(level != "FAIL" for level, _ in listed)
 
 
 def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
@@ -110,8 +110,8 @@ def _vectors() -> Iterator[Finding]:
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         kernel = compile_kernel(lambda x: x * x + 1.0, np.zeros((), np.float32), folder=Path(folder))
-    found = kernel(np.arange(100, dtype=np.float32))
-    if not np.array_equal(found, np.arange(100, dtype=np.float32) ** 2 + 1):
+    result = kernel(np.arange(100, dtype=np.float32))
+    if not np.array_equal(result, np.arange(100, dtype=np.float32) ** 2 + 1):
         yield "FAIL", f"simd ({target.describe()}): a compiled kernel gives wrong numbers"
         return
     yield "ok", f"simd: {target.describe()}; a kernel compiles and runs in {time.perf_counter() - started:.2f} s"
@@ -130,9 +130,9 @@ def _disk() -> Iterator[Finding]:
 def _noise() -> Iterator[Finding]:
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
         key = stream_keys(seed, domain, generation, *ids)
-        found = normal_integers(np, key, np.arange(len(expected), dtype=np.uint32))
-        if found.tolist() != list(expected):
-            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}; expected {expected}"
+        noise = normal_integers(np, key, np.arange(len(expected), dtype=np.uint32))
+        if noise.tolist() != list(expected):
+            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {noise.tolist()}; expected {expected}"
             return
     yield "ok", f"noise equals its {len(TEST_VECTORS)} test vectors"
 

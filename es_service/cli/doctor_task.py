@@ -35,7 +35,8 @@ def _findings(name: str) -> Iterator[Finding]:
     yield "ok", _what(task)
     bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
     shown = [
-        f"{one} without bounds" if pair == UNBOUNDED else f"{one} in [{pair[0]:g}, {pair[1]:g}]" for one, pair in bounds
+        f"{dimension} without bounds" if pair == UNBOUNDED else f"{dimension} in [{pair[0]:g}, {pair[1]:g}]"
+        for dimension, pair in bounds
     ]
     yield "ok", f"its descriptor is {', '.join(shown)}"
     if task.kind == "jax":
@@ -56,7 +57,7 @@ def _findings(name: str) -> Iterator[Finding]:
     else:
         yield "ok", f"it repeats bit for bit with the same seed and actions: {', '.join(tried)}"
     unit = "calls" if task.kind == "function" else "steps"
-    rate, memory = max(one["steps_per_second"] for one in (first, second)), first["peak_mib"]
+    rate, memory = max(result["steps_per_second"] for result in (first, second)), first["peak_mib"]
     yield "ok", f"{rate:,.0f} {unit}/s on one core without a policy; its process takes {memory:,} MiB"
 
 

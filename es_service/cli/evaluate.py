@@ -69,9 +69,9 @@ def evaluate(
         raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
     cells = list(dict.fromkeys(place_of(text) for text in cell or ()))
     if workers is not None:  # before the first run, since the other runs would have the same problem
-        for _, found in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
-            if isinstance(found, ConfigError) and found.field == "compute.workers":
-                raise found
+        for _, result in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
+            if isinstance(result, ConfigError) and result.field == "compute.workers":
+                raise result
     if certify:
         for option, value in (("--all", every or None), ("--seed", seed)):
             if value is not None:
@@ -112,12 +112,12 @@ def evaluate(
     problems: list[dict[str, str]] = []
     with csv_file(out, print_note) as write:
         if single:
-            found = rows_of(folders[0])
+            evaluated_rows = rows_of(folders[0])
         else:
             if not as_json:
                 print_header(console, width)
-            found = (row for _, row in readable(items_of_each(folders, rows_of), problems))
-        for row in found:
+            evaluated_rows = (row for _, row in readable(items_of_each(folders, rows_of), problems))
+        for row in evaluated_rows:
             rows.append(row)
             write(row)
     if as_json:

@@ -104,11 +104,11 @@ def _require_absolute_start(config: Path, wanted: Mapping[str, Any]) -> None:
 @of_jobs(name="jobs")
 def jobs_(address: JobsOption, as_json: JsonOption = False) -> None:
     """List the jobs of a cluster, newest first: id, state, folder."""
-    found = jobs.list_jobs(address)
+    listed = jobs.list_jobs(address)
     if as_json:
-        print_json([asdict(job) for job in found])
+        print_json([asdict(job) for job in listed])
         return
-    for job in found:
+    for job in listed:
         print(f"{job.id}  {job.state:<9}  {job.folder}")
 
 

@@ -50,6 +50,6 @@ def polish(
     session(folder, partial(api.run, config, folder), log)
     tell = partial(print_notice, errors)
     before, after = certify_both(api.open_run(parent), api.open_run(folder), config, workers, tell)
-    for what, found in (("before", before), ("after", after)):
+    for what, certified in (("before", before), ("after", after)):
         print_line(console, f"certified {what} polishing:")
-        print_certified(console, found)
+        print_certified(console, certified)

@@ -92,10 +92,10 @@ def _compare(
             else:
                 print_note(f"note: {folder} is left out, since it has no finished generation yet")
 
-    found = list(comparable())
+    runs = list(comparable())
     if len(folders) == 1 and not group_by:
-        group_by = swept_keys(found)
-    for file in write_compared(found, out, group_by, threshold, figures):
+        group_by = swept_keys(runs)
+    for file in write_compared(runs, out, group_by, threshold, figures):
         print(file)
     if problems:
         raise typer.Exit(1)

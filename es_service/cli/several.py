@@ -28,7 +28,7 @@ def is_single(folders: Sequence[Path]) -> bool:
 
 def started_runs(folders: Sequence[Path]) -> list[Path]:
     """Folders of the runs that have started, and of those that cannot be found."""
-    return [folder for folder, found in of_each(folders, lambda run: run) if found is not None]
+    return [folder for folder, result in of_each(folders, lambda run: run) if result is not None]
 
 
 def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tuple[Path, T | ServiceError | None]]:
@@ -50,8 +50,8 @@ def items_of_each(
         for run in runs:
             try:
                 waits = run != folder and not holds_run(run)
-                for found in [None] if waits else read(run):
-                    yield run, found
+                for result in [None] if waits else read(run):
+                    yield run, result
             except Interrupted:
                 raise
             except ServiceError as error:
@@ -67,15 +67,15 @@ def readable(
         each: what `of_each` or `items_of_each` returns.
         problems: gets what `--json` prints of each run that cannot be read.
     """
-    for folder, found in each:
-        if found is None:
+    for folder, result in each:
+        if result is None:
             print_note(f"note: {folder} has not started")
-        elif isinstance(found, ServiceError):
-            message = error_message(found)
+        elif isinstance(result, ServiceError):
+            message = error_message(result)
             print_error(message if str(folder) in message else f"{folder}: {message}")
-            problems.append(problem_data(folder, found))
+            problems.append(problem_data(folder, result))
         else:
-            yield folder, found
+            yield folder, result
 
 
 def problem_data(folder: Path, error: ServiceError) -> dict[str, str]:

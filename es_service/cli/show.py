@@ -59,14 +59,14 @@ def status(
 
 def _print_standings(folders: list[Path]) -> bool:
     """Print a list with an object for each run; return whether all runs could be read."""
-    found: list[dict[str, Any]] = []
+    statuses: list[dict[str, Any]] = []
     for folder, data in of_each(folders, lambda run: status_data(read_status(api.open_run(run)))):
         if isinstance(data, ServiceError):
-            found.append(problem_data(folder, data))
+            statuses.append(problem_data(folder, data))
         else:
-            found.append(data or {"run": str(folder), "state": NOT_STARTED, "newest": None})
-    print_json(found)
-    return not any("error" in one for one in found)
+            statuses.append(data or {"run": str(folder), "state": NOT_STARTED, "newest": None})
+    print_json(statuses)
+    return not any("error" in run_status for run_status in statuses)
 
 
 def digest_(
@@ -76,18 +76,18 @@ def digest_(
 ) -> None:
     """Check all data of a run and print a SHA-256 of everything deterministic in it; of several runs, a line each."""
     if is_single(folders):
-        found, mixed = digest.checked_parts(folders[0])
+        part_digests, mixed = digest.checked_parts(folders[0])
         if as_json:
-            print_json(digest_data(found, mixed=mixed))
+            print_json(digest_data(part_digests, mixed=mixed))
         else:
-            _print_digest(found, "  mixed" if mixed else "", parts=parts)
+            _print_digest(part_digests, "  mixed" if mixed else "", parts=parts)
         return
 
     def show(folder: Path) -> dict[str, Any]:
-        found, mixed = digest.checked_parts(folder)
+        part_digests, mixed = digest.checked_parts(folder)
         if not as_json:
-            _print_digest(found, f"  {folder}{'  mixed' if mixed else ''}", parts=parts)
-        return {"run": str(folder), **digest_data(found, mixed=mixed)}
+            _print_digest(part_digests, f"  {folder}{'  mixed' if mixed else ''}", parts=parts)
+        return {"run": str(folder), **digest_data(part_digests, mixed=mixed)}
 
     problems: list[dict[str, str]] = []
     results = [data for _, data in readable(of_each(folders, show), problems)]
@@ -97,11 +97,11 @@ def digest_(
         raise typer.Exit(1)
 
 
-def _print_digest(found: Mapping[str, str], ending: str, *, parts: bool) -> None:
+def _print_digest(part_digests: Mapping[str, str], ending: str, *, parts: bool) -> None:
     if parts:
-        for name, value in found.items():
+        for name, value in part_digests.items():
             print(f"{value}  {name}")
-    print(f"{digest.digest_of(found)}{ending}", flush=True)
+    print(f"{digest.digest_of(part_digests)}{ending}", flush=True)
 
 
 def config_(

@@ -138,7 +138,7 @@ def _compare(runs: Sequence[SweptRun], out: Path, keys: Sequence[str]) -> None:
 
 def seeds_of(text: str) -> list[int]:
     """Seeds from text such as 0:5, which is 0 to 4, or 0,7 or 0:3,10:12."""
-    found: list[int] = []
+    seeds: list[int] = []
     for part in text.split(","):
         if (match := re.fullmatch(r"\s*(\d+)(?::(\d+))?\s*", part)) is None:
             raise ConfigError(
@@ -156,8 +156,8 @@ def seeds_of(text: str) -> list[int]:
                 value=text,
                 suggestion=f"{last}:{first + 1}",
             )
-        found += range(first, last)
-    return found
+        seeds += range(first, last)
+    return seeds
 
 
 def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:
@@ -177,8 +177,8 @@ def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:
                 problems.append(Problem(f"--grid {word}: {error}", key, text))
                 continue
             grid[key] = []
-            for one in texts:
-                values, wrong = parse_overrides([f"{key}={one}"])
+            for value_text in texts:
+                values, wrong = parse_overrides([f"{key}={value_text}"])
                 problems += wrong
                 grid[key] += values.values()
     if problems:

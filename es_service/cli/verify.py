@@ -37,37 +37,37 @@ def verify(
         print_error(error)
         raise typer.Exit(3) from None
     digest = run.digest()  # raises if stored data are damaged
-    found: list[Recomputed] = []
-    for one in recomputed:
-        found.append(one)
+    groups: list[Recomputed] = []
+    for group in recomputed:
+        groups.append(group)
         if not as_json:
-            print_line(console, _line(one))
+            print_line(console, _line(group))
     certified = []
-    for one, differences, changes in recomputed_certifications(run, workers):
-        certified.append((one, differences))
+    for policy, differences, changes in recomputed_certifications(run, workers):
+        certified.append((policy, differences))
         if not as_json:
             what = f"differs: {', '.join(differences)}" if differences else "equal"
             since = f"; since it was made: {', '.join(changes)}" if changes else ""
-            print_line(console, f"certification {one.number}, {one.name}: {what}{since}")
+            print_line(console, f"certification {policy.number}, {policy.name}: {what}{since}")
     why = ""
-    if any(one.differences for one in found) or any(differences for _, differences in certified):
+    if any(group.differences for group in groups) or any(differences for _, differences in certified):
         why = why_not_repeatable(run, changed_config(run.present_config, {}))
-    equal = not any(one.differences for one in found) and not any(differences for _, differences in certified)
+    equal = not any(group.differences for group in groups) and not any(differences for _, differences in certified)
     if as_json:
         print_json(
             {
                 "digest": digest,
                 "equal": equal,
                 "does_not_repeat": why,
-                "recomputed": [asdict(one) for one in found],
+                "recomputed": [asdict(group) for group in groups],
                 "certified": [
-                    {"certification": one.number, "policy": one.name, "differences": differences}
-                    for one, differences in certified
+                    {"certification": policy.number, "policy": policy.name, "differences": differences}
+                    for policy, differences in certified
                 ],
             }
         )
     else:
-        again = sum(one.last - one.first + 1 for one in found)
+        again = sum(group.last - group.first + 1 for group in groups)
         print(f"{digest}  {'equal' if equal else 'different'}")
         print_note(f"{again:,} of {(run.generation or 0) + 1:,} generations were computed again")
         if why:
@@ -79,12 +79,12 @@ def verify(
     raise typer.Exit(0 if equal else 3 if why else 1)
 
 
-def _line(one: Recomputed) -> str:
-    which = f"generation {one.first}" if one.first == one.last else f"generations {one.first} to {one.last}"
-    if not one.differences:
+def _line(group: Recomputed) -> str:
+    which = f"generation {group.first}" if group.first == group.last else f"generations {group.first} to {group.last}"
+    if not group.differences:
         line = f"{which}: equal"
-    elif one.first == one.last:
-        line = f"{which} differs: {', '.join(one.differences)}"
+    elif group.first == group.last:
+        line = f"{which} differs: {', '.join(group.differences)}"
     else:
-        line = f"{which}: generation {one.last} differs: {', '.join(one.differences)}"
-    return line + (f"; since the run computed it: {', '.join(one.changes)}" if one.changes else "")
+        line = f"{which}: generation {group.last} differs: {', '.join(group.differences)}"
+    return line + (f"; since the run computed it: {', '.join(group.changes)}" if group.changes else "")

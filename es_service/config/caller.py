@@ -22,9 +22,9 @@ OPTIONS = {
 
 def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
     """Description of the task with these options; those that are left out have their defaults."""
-    found = {name: option.default for name, option in OPTIONS.items()} | dict(options)
+    values = {name: option.default for name, option in OPTIONS.items()} | dict(options)
     observations, actions, parameters, dimensions, steps = (
-        value if isinstance(value := found[name], int) else 0 for name in OPTIONS
+        value if isinstance(value := values[name], int) else 0 for name in OPTIONS
     )
     names = tuple(f"p{index}" for index in range(parameters))
     return TaskSpec(

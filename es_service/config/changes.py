@@ -104,24 +104,24 @@ def foreign_keys(
     def is_replaced(key: str) -> bool:
         return key in wanted and wanted[key] != values.get(key)
 
-    found: dict[str, str] = {}
+    foreign: dict[str, str] = {}
     if is_replaced("task.environment"):
         why = f"{wanted['task.environment']} replaces its task"
-        found |= {key: why for key in values if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
+        foreign |= {key: why for key in values if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
     if settings is None:
-        return found
+        return foreign
     chosen = filled_in({**values, **wanted}, settings) | dict(values) | dict(wanted)
     if other := is_replaced("search.algorithm"):
         known = values if ":" in str(values.get("search.algorithm")) else all_search_fields(algorithms)
         known = {*known, *settings.unused}
         why = f"{wanted['search.algorithm']} replaces its algorithm"
-        found |= {key: why for key in values if key in known and not has_effect(key, settings)}
+        foreign |= {key: why for key in values if key in known and not has_effect(key, settings)}
     for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
         if other or is_replaced(kind):
             why = f"{chosen[kind]} replaces its {kind}"
             own = [key for key in values if key.startswith(kind.removesuffix(KIND))]
-            found |= {key: why for key in own if kinds_without(key, chosen[kind], settings)}
-    return {key: why for key, why in found.items() if key not in wanted}
+            foreign |= {key: why for key in own if kinds_without(key, chosen[kind], settings)}
+    return {key: why for key, why in foreign.items() if key not in wanted}
 
 
 def changed_constants(

@@ -114,33 +114,33 @@ def key_problems(
         settings: those of the method; None if it is not known, which allows the keys of every method.
     """
     known = FIELDS | (search_fields(settings) if settings else all_search_fields(algorithms))
-    parts = {part: kinds for one in algorithms.values() for part, kinds in parts_of(one.settings).items()}
-    found: dict[str, Problem] = {}
+    parts = {part: kinds for method in algorithms.values() for part, kinds in parts_of(method.settings).items()}
+    problems: dict[str, Problem] = {}
     for key, value in values.items():
         if key in known:
             part = key.rpartition(".")[0]
             if settings and (kinds := kinds_without(key, kind := values.get(f"{part}.{KIND}"), settings)):
                 what = f"{show(value)} has no effect with {part}.{KIND} = {kind}; leave it out"
-                found[key] = problem_of(key, value, f"{what} (a key of kind {one_of(kinds)})")
+                problems[key] = problem_of(key, value, f"{what} (a key of kind {one_of(kinds)})")
         elif not (key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2):
             group = key in (*GROUPS, *parts)
             if key in RENAMED or key.startswith(SEARCH_OPTIONS):
                 now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
-                found[key] = problem_of(key, value, f"this key is now {now}", suggestion=now)
+                problems[key] = problem_of(key, value, f"this key is now {now}", suggestion=now)
             elif group and key in wanted:
-                first = next((one for one in known if one.startswith(f"{key}.")), f"{key}.NAME")
+                first = next((known_key for known_key in known if known_key.startswith(f"{key}.")), f"{key}.NAME")
                 what = f"this is a section; set its keys one by one, such as {first}=..."
-                found[key] = problem_of(key, value, what, suggestion=first)
+                problems[key] = problem_of(key, value, what, suggestion=first)
             elif group:
-                found[key] = problem_of(key, value, _not_a_mapping(key, value))
+                problems[key] = problem_of(key, value, _not_a_mapping(key, value))
             elif methods_with(key, algorithms) and key.startswith("search."):
-                found[key] = no_effect(key, value, values["search.algorithm"], algorithms)
+                problems[key] = no_effect(key, value, values["search.algorithm"], algorithms)
             else:
                 groups = GROUPS if isinstance(value, Mapping) else ()
-                found[key] = _unknown_key(key, (*groups, *known), value)
-                if found[key].suggestion is None:
-                    found[key] = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
-    return found
+                problems[key] = _unknown_key(key, (*groups, *known), value)
+                if problems[key].suggestion is None:
+                    problems[key] = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
+    return problems
 
 
 MOST_NAMED = 16

@@ -139,7 +139,7 @@ def _load(
     wanted, more = parse_overrides(overrides)
     problems += more
     chosen = {**defaults, **values, **wanted}
-    found: dict[str, Any] = {}
+    selected: dict[str, Any] = {}
     unknown: list[Problem] = []
     for key, what, known, besides in (
         (
@@ -155,11 +155,11 @@ def _load(
             unknown.append(problem_of(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
         try:
             if not isinstance(given, str) or not given:
-                found[key] = None
+                selected[key] = None
             elif isinstance(known, TaskTable):
-                found[key] = known.chosen(given, **settings_of_task(values, wanted))
+                selected[key] = known.chosen(given, **settings_of_task(values, wanted))
             else:
-                found[key] = known[given]
+                selected[key] = known[given]
         except KeyError:
             allowed, meant = f"{one_of(known)}, or {besides}", nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""
@@ -167,8 +167,8 @@ def _load(
             unknown.append(Problem(sentence, key, given, allowed, meant))
         except ConfigError as error:
             unknown.append(Problem(f"{key}: {error}", key, given))
-    task: TaskSpec | None = found.get("task.environment")
-    method = found.get("search.algorithm")
+    task: TaskSpec | None = selected.get("task.environment")
+    method = selected.get("search.algorithm")
     settings: type[SearchConfig] | None = None if method is None else method.settings
 
     foreign = foreign_keys(values, wanted, settings, algorithms)
@@ -258,25 +258,25 @@ def _value_problems(
     """
     if settings is None:
         known = [method.settings for method in algorithms.values()]
-        settings = max(known, key=lambda one: len(values.keys() & search_fields(one)))
+        settings = max(known, key=lambda candidate: len(values.keys() & search_fields(candidate)))
     fields, parts = FIELDS | all_search_fields(algorithms) | search_fields(settings), parts_of(settings)
     kinds = {key: fields[key].default for part in parts if (key := f"{part}.kind")}
     nested = _nested({key: value for key, value in (kinds | dict(values)).items() if not key.startswith(TASK_OPTIONS)})
-    found: set[str] = set()
+    wrong_keys: set[str] = set()
     problems: dict[str, Problem] = {}
     for model, section, mapping in ((RunConfig, (), nested), (settings, ("search",), nested.pop("search"))):
         try:
             model.model_validate(mapping)
         except ValidationError as error:
             for item in error.errors(include_url=False):
-                place = [str(one) for one in (*section, *item["loc"])]
+                place = [str(component) for component in (*section, *item["loc"])]
                 if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
                     place[2:3] = [] if len(place) > 2 else ["kind"]
                 if not item["loc"]:  # a rule that the class of a user's search has
                     problems["search"] = problem_of("search", None, item["msg"])
                 # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
-                found |= {".".join(place[: k + 1]) for k in range(len(place))}
-    return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in found}
+                wrong_keys |= {".".join(place[: k + 1]) for k in range(len(place))}
+    return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in wrong_keys}
 
 
 def _bad_value(name: str, value: object, field: FieldInfo) -> Problem:
@@ -303,7 +303,7 @@ def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:
             return words
     if annotation in _PLAIN:
         limits = [
-            f"{words} {getattr(one, name):g}" for one in metadata for name, words in _LIMITS if hasattr(one, name)
+            f"{words} {getattr(limit, name):g}" for limit in metadata for name, words in _LIMITS if hasattr(limit, name)
         ]
         return ", ".join([_PLAIN[annotation], *limits])
     origin, parts = get_origin(annotation), get_args(annotation)

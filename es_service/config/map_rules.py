@@ -27,7 +27,7 @@ def default_bounds(values: Mapping[str, Any], task: TaskSpec) -> Bounds | None:
     """The bounds of the descriptor; None if a map needs them and the descriptor has none."""
     if UNBOUNDED in task.descriptor_bounds and values.get("map.enabled", True):
         return None
-    return tuple((-1.0, 1.0) if one == UNBOUNDED else one for one in task.descriptor_bounds)
+    return tuple((-1.0, 1.0) if pair == UNBOUNDED else pair for pair in task.descriptor_bounds)
 
 
 def default_kind(dimensions: int) -> str:

@@ -40,7 +40,7 @@ KIND = "kind"
 def parts_of(settings: type[SearchConfig]) -> dict[str, dict[str, type[Section]]]:
     """Key of each part, such as search.step -> kind -> the class with its keys."""
     return {
-        f"search.{name}": {one.model_fields[KIND].default: one for one in get_args(field.annotation)}
+        f"search.{name}": {section.model_fields[KIND].default: section for section in get_args(field.annotation)}
         for name, field in settings.model_fields.items()
         if field.discriminator == KIND
     }
@@ -49,27 +49,27 @@ def parts_of(settings: type[SearchConfig]) -> dict[str, dict[str, type[Section]]
 @cache
 def search_fields(settings: type[SearchConfig]) -> dict[str, FieldInfo]:
     """Dotted key -> field of each key that a method has, for parts those of every kind."""
-    found: dict[str, FieldInfo] = {}
+    fields: dict[str, FieldInfo] = {}
     for name, field in settings.model_fields.items():
         key = f"search.{name}"
         kinds = parts_of(settings).get(key)
         if kinds is None:
-            found[key] = field
+            fields[key] = field
             continue
-        found[f"{key}.{KIND}"] = kind = Field(field.default.kind, description=field.description)
+        fields[f"{key}.{KIND}"] = kind = Field(field.default.kind, description=field.description)
         kind.annotation = Literal[tuple(kinds)]
-        for one in kinds.values():
-            for leaf, its in one.model_fields.items():
-                found.setdefault(f"{key}.{leaf}", its)
-    return found
+        for section in kinds.values():
+            for leaf, its in section.model_fields.items():
+                fields.setdefault(f"{key}.{leaf}", its)
+    return fields
 
 
 def all_search_fields(algorithms: Methods) -> dict[str, FieldInfo]:
     """The fields of every shipped method, by key; of several with the same key, that of the first method."""
-    found: dict[str, FieldInfo] = {}
+    fields: dict[str, FieldInfo] = {}
     for method in algorithms.values():
-        found = search_fields(method.settings) | found
-    return found
+        fields = search_fields(method.settings) | fields
+    return fields
 
 
 def are_alike(old: object, new: object, algorithms: Methods) -> bool:
@@ -109,7 +109,7 @@ def kinds_without(key: str, kind: object, settings: type[SearchConfig]) -> tuple
     kinds = parts_of(settings).get(part, {})
     if not isinstance(kind, str) or kind not in kinds or leaf in kinds[kind].model_fields:
         return ()
-    return tuple(name for name, one in kinds.items() if leaf in one.model_fields)
+    return tuple(name for name, section in kinds.items() if leaf in section.model_fields)
 
 
 def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: Any = None) -> Problem:

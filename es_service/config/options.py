@@ -37,7 +37,7 @@ def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> di
     descriptor = chosen.get("task.descriptor")
     if isinstance(descriptor, list):
         descriptor = tuple(descriptor)
-    is_chosen = descriptor and (isinstance(descriptor, str) or all(type(one) is int for one in descriptor))
+    is_chosen = descriptor and (isinstance(descriptor, str) or all(type(index) is int for index in descriptor))
     options = {key: value for key, value in options_of(chosen).items() if isinstance(value, bool | int | float | str)}
     return {"options": options, "descriptor": descriptor if is_chosen else None}
 
@@ -54,7 +54,7 @@ def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, O
         values: flat values of a config, of which the options are read.
     """
     declared = task.options
-    found: dict[str, OptionValue] = {f"{TASK_OPTIONS}{name}": option.default for name, option in declared.items()}
+    options: dict[str, OptionValue] = {f"{TASK_OPTIONS}{name}": option.default for name, option in declared.items()}
     problems = []
     for name, value in options_of(values).items():
         key = f"{TASK_OPTIONS}{name}"
@@ -66,8 +66,8 @@ def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, O
         elif (read := _read(declared[name], value)) is None:
             problems.append(wrong_value(key, value, allowed_text(declared[name]), declared[name].choices))
         else:
-            found[key] = read
-    return found, problems
+            options[key] = read
+    return options, problems
 
 
 def allowed_text(option: Option) -> str:

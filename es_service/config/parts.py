@@ -293,4 +293,4 @@ Objectives = Annotated[
 
 def outputs_of(objectives: Iterable[Objective]) -> tuple[str, ...]:
     """Outputs of episodes that any of the objectives reads."""
-    return tuple(sorted({name for one in objectives for name in one.reads}))
+    return tuple(sorted({name for objective in objectives for name in objective.reads}))

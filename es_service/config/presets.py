@@ -59,13 +59,13 @@ def preset_values(preset: str, settings: type[Any]) -> dict[str, object]:
 
 def preset_table(algorithms: Mapping[str, Any]) -> list[PresetRow]:
     """Rows of all methods, for documentation: those for several methods first."""
-    found: dict[int, PresetRow] = {}
+    rows: dict[int, PresetRow] = {}
     for name, method in algorithms.items():
         settings = method.settings
         own_keys = {f"search.{key}" for key in settings.model_fields.keys() - settings.__base__.model_fields.keys()}
         own_rows = vars(settings).get("presets", ())
-        found |= {
+        rows |= {
             id(row): replace(row, method=name) if row in own_rows and row.key not in own_keys else row
             for row in preset_rows(settings)
         }
-    return sorted(found.values(), key=lambda row: row.method is not None)
+    return sorted(rows.values(), key=lambda row: row.method is not None)

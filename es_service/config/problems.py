@@ -60,7 +60,7 @@ def wrong_value(field: str, value: Any, allowed: str, choices: Collection[Any] =
     elif isinstance(value, bool | int | float) and allowed == "text":
         hint = "; write it in quotes"
     elif isinstance(value, str):
-        meant = nearest(value, [one for one in choices if isinstance(one, str)])
+        meant = nearest(value, [choice for choice in choices if isinstance(choice, str)])
     return not_allowed(field, value, allowed, hint=hint, suggestion=meant)
 
 

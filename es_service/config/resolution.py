@@ -269,7 +269,7 @@ def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Probl
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
     rollout = rollouts.get(values.get("compute.rollout", ""))
     if threads and not (inline and (rollout is None or rollout.runs_in_threads)):
-        able = one_of([name for name, one in rollouts.items() if one.runs_in_threads])
+        able = one_of([name for name, candidate in rollouts.items() if candidate.runs_in_threads])
         what = (
             f"threads needs compute.engine = inline and compute.rollout = {able}, because only its code runs in "
             "several threads at once; must be processes"
@@ -303,7 +303,7 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
     """The problem of a rollout that does not exist, or that cannot be used for this config."""
     if (name := values.get("compute.rollout")) is None:
         return []
-    fit = [other for other, one in rollouts.items() if task is None or task.kind in one.task_kinds]
+    fit = [other for other, candidate in rollouts.items() if task is None or task.kind in candidate.task_kinds]
     if (rollout := rollouts.get(name)) is None:
         return [wrong_value("compute.rollout", name, f"auto or {one_of(fit)}", fit)]
     if _on_gpu(values) and not rollout.runs_on_gpus:

@@ -30,13 +30,13 @@ def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
         return []
     folder, _ = start_of(start)
     try:
-        found = os.stat(folder)
+        status = os.stat(folder)
     except (FileNotFoundError, NotADirectoryError):
         what = "does not exist"
     except (OSError, ValueError) as error:  # permission denied, too long, or a null character
         what = f"cannot be accessed ({getattr(error, 'strerror', error)})"
     else:
-        what = "" if stat.S_ISDIR(found.st_mode) else "is a file"
+        what = "" if stat.S_ISDIR(status.st_mode) else "is a file"
     allowed = "the folder of another run, or null"
     return (
         [problem_of("search.init_from", start, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []

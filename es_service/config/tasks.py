@@ -87,7 +87,9 @@ def task_of(config: RunConfig) -> TaskSpec:
 
 def _changes(before: TaskSpec, now: TaskSpec) -> list[str]:
     """Differences between two descriptions of a task, apart from the line that is only shown."""
-    values = [(one.name, getattr(before, one.name), getattr(now, one.name)) for one in dataclasses.fields(TaskSpec)]
+    values = [
+        (field.name, getattr(before, field.name), getattr(now, field.name)) for field in dataclasses.fields(TaskSpec)
+    ]
     return [f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if name != "summary" and old != new]
 
 
@@ -123,15 +125,15 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
 
     Fields that only older versions had are left out.
     """
-    known = {one.name for one in dataclasses.fields(TaskSpec)}
+    known = {field.name for field in dataclasses.fields(TaskSpec)}
 
     def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
         return tuple((float(low), float(high)) for low, high in pairs)
 
-    def option(found: Mapping[str, Any] | list) -> Option:
-        if isinstance(found, list):  # as versions up to 0.11 stored the allowed values
-            return choice(*found)
-        return Option(**{**found, "choices": tuple(found["choices"])})
+    def option(stored: Mapping[str, Any] | list) -> Option:
+        if isinstance(stored, list):  # as versions up to 0.11 stored the allowed values
+            return choice(*stored)
+        return Option(**{**stored, "choices": tuple(stored["choices"])})
 
     return TaskSpec(
         **{name: value for name, value in fields.items() if name in known}
@@ -143,7 +145,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
             "parameters": None
             if fields.get("parameters") is None
             else ParameterSpec.from_fields(*fields["parameters"]),
-            "options": {name: option(found) for name, found in fields["options"].items()},
+            "options": {name: option(stored) for name, stored in fields["options"].items()},
             "descriptors": {
                 name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()
             },

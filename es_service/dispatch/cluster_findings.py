@@ -72,8 +72,8 @@ def node_findings(answers: Mapping[str, Software], silent: Mapping[str, str], he
         logs = "read Ray's logs on it, in /tmp/ray/session_latest/logs, or remove it from the cluster"
         where.setdefault(("FAIL", f"{what}; {logs}"), []).append(node)
     for node, theirs in answers.items():
-        for one in _differences(theirs, here):
-            where.setdefault(one, []).append(node)
+        for finding in _differences(theirs, here):
+            where.setdefault(finding, []).append(node)
     if not any(level == "FAIL" for level, _ in where):
         ours = ", ".join(f"{name} {here['versions'][name]}" for name in ("ray", "python", "es-service"))
         yield "ok", f"these nodes have {ours}, and the packages and the code of this host"

@@ -227,7 +227,7 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         self._phase += 1
         most = self._state.limits.episodes_together
-        pieces = [[one] if most is None else pieces_of(one, most) for one in work]
+        pieces = [[subject_chunk] if most is None else pieces_of(subject_chunk, most) for subject_chunk in work]
         parts = self._parts([piece for of_chunk in pieces for piece in of_chunk])
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         most = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
@@ -238,7 +238,10 @@ class Engine(Generic[AnyTransport]):
             while pending(self._state):
                 self._serve()
             results = (result for item_id, part in parts for result in separated(part, self._results.pop(item_id)))
-            return [whole(one, list(islice(results, len(own)))) for one, own in zip(work, pieces, strict=True)]
+            return [
+                whole(subject_chunk, list(islice(results, len(own))))
+                for subject_chunk, own in zip(work, pieces, strict=True)
+            ]
 
         return wait
 

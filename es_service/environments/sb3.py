@@ -77,8 +77,8 @@ class SB3VecEnv(_vec_env.VecEnv):
         observation_N_O, reward_N, terminated_N, truncated_N, info = self.environments.step(actions_N_A)
         done_N = terminated_N | truncated_N
         infos = self._infos(info)
-        for one, truncated, terminated in zip(infos, truncated_N.tolist(), terminated_N.tolist(), strict=True):
-            one["TimeLimit.truncated"] = truncated and not terminated
+        for lane_info, truncated, terminated in zip(infos, truncated_N.tolist(), terminated_N.tolist(), strict=True):
+            lane_info["TimeLimit.truncated"] = truncated and not terminated
         if done_N.any():
             lasts = self._infos(info["final_info"])
             for lane in np.flatnonzero(done_N).tolist():

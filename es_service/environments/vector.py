@@ -213,7 +213,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
     def _masked(self, shown: Mapping[str, Any], lane_M: NDArray[np.intp]) -> dict[str, Any]:
         mask_N = np.zeros(self.num_envs, bool)
         mask_N[lane_M] = True
-        return {key: one for name, array in shown.items() for key, one in ((name, array), (f"_{name}", mask_N.copy()))}
+        return {
+            key: value for name, array in shown.items() for key, value in ((name, array), (f"_{name}", mask_N.copy()))
+        }
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
@@ -224,7 +226,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"seed is a list of {len(seed)}; must have one for each of the {self.num_envs} environments"
             )
-        return [None if one is None else seed_given(int(one)) for one in seed]
+        return [None if lane_seed is None else seed_given(int(lane_seed)) for lane_seed in seed]
 
     def _mask(self, options: Mapping[str, Any] | None) -> NDArray[np.bool_]:
         mask_N = (options or {}).get("reset_mask")

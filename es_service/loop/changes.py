@@ -84,7 +84,7 @@ def _compare(parts: dict[str, Arrays | None], name: str, now: Arrays, then: Arra
 
 
 def archive_changes(archive: NoveltyArchive, before: NoveltyArchive | None) -> dict[str, Arrays | None]:
-    """Blocks of the novelty archive from the first entry on that differs from an earlier one; None for those gone."""
+    """Blocks of the novelty archive from the first entry on that differs from `before`; None for removed blocks."""
     before = before or empty_archive(archive.descriptor_N_B.shape[1])
     same = same_entries(archive, before)
     if same == archive.size == before.size:
@@ -98,8 +98,8 @@ def _blocks(archive: NoveltyArchive) -> int:
 
 
 def map_changes(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays | None]:
-    """Parts of the cells whose entries differ from an earlier map, None for cells that are empty now; all of them, and
-    what the map has besides, without an earlier one."""
+    """Parts of the cells whose entries differ from an earlier map, None for cells that are empty now; without an
+    earlier map all of its parts."""
     parts: dict[str, Arrays | None] = {}
     if before is None or map_.geometry is not before.geometry or (map_.samples_N is None) != (before.samples_N is None):
         _compare(parts, GEOMETRY_PART, map_to_arrays(map_), before and map_to_arrays(before))
@@ -109,7 +109,7 @@ def map_changes(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Ar
 
 
 def _emptied(map_: BehaviourMap, before: BehaviourMap | None) -> list[int]:
-    """Cells that an earlier map had filled and this one has not."""
+    """Cells that are filled in an earlier map and empty now."""
     return [] if before is None else before.cell_N[~rows_in(before, map_)[0]].tolist()
 
 
@@ -131,7 +131,7 @@ def _elite_changes(
     parts: dict[str, Arrays | None] = dict.fromkeys(map(elite_part, _emptied(map_, before)))
     parts |= {elite_part(cell): elite_to_arrays(elite) for cell, elite in state.elites.items()}
     for row in np.flatnonzero(~was_N):
-        cell, generation, centre = (int(one[row]) for one in (map_.cell_N, map_.generation_N, map_.centre_N))
+        cell, generation, centre = (int(column[row]) for column in (map_.cell_N, map_.generation_N, map_.centre_N))
         if cell in state.elites:
             continue
         origin = before.cell_of(generation, centre) if before is not None else None

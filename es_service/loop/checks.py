@@ -119,7 +119,10 @@ def invalidate(
         EvaluationError: more than `max_invalid_fraction` of a generation's members are invalid.
     """
     valid = [valid_members(population) for population in populations]
-    invalid, members = sum(int(np.count_nonzero(~one)) for one in valid), sum(one.size for one in valid)
+    invalid, members = (
+        sum(int(np.count_nonzero(~mask_P_S)) for mask_P_S in valid),
+        sum(mask_P_S.size for mask_P_S in valid),
+    )
     if invalid > max_invalid_fraction * members:
         told = [text for population in populations for text in population.failures]
         first = f" The first of which more is known: {told[0]}" if told else ""

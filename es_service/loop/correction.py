@@ -76,8 +76,8 @@ def correct(
             fitness_N = doubles(results.fitness).mean(axis=1)[valid_N]
             again = insert_each(again, descriptor_N_B, fitness_N, generation, *columns)
         steps, episodes = steps + steps_of(results), episodes + results.fitness.size
-    found = map_statistics(again, settings.qd_offset, None)
-    values = found["coverage"], found["qd_score"], found["map_fitness_max"]
+    statistics = map_statistics(again, settings.qd_offset, None)
+    values = statistics["coverage"], statistics["qd_score"], statistics["map_fitness_max"]
     return Correction(dict(zip(CORRECTED, values, strict=True)), steps, episodes)
 
 
@@ -94,10 +94,10 @@ def _origin(before: RunState, map_: BehaviourMap, cell: int) -> int:
 def _episodes(search: Search, evaluator: Evaluator, elites: list[Elite], generation: int, ask: int) -> EpisodesResult:
     """Results of some elites' episodes, [N, E]."""
     statistics: list[NDArray[np.float32]] = [
-        np.stack([getattr(one, name) for one in elites]) for name in ("observation_mean_O", "observation_std_O")
+        np.stack([getattr(elite, name) for elite in elites]) for name in ("observation_mean_O", "observation_std_O")
     ]
     work = policy_work(
-        unvaried([one.centre_D for one in elites]),
+        unvaried([elite.centre_D for elite in elites]),
         (statistics[0], statistics[1]),
         search.config.map.correct_episodes,
         seed=search.config.seed,
@@ -106,4 +106,4 @@ def _episodes(search: Search, evaluator: Evaluator, elites: list[Elite], generat
         domain=Domain.CORRECTION_RESET,
     )
     results = evaluator.evaluate(work.work)
-    return policy_episodes(work, [one for one in results if isinstance(one, EpisodesResult)])
+    return policy_episodes(work, [result for result in results if isinstance(result, EpisodesResult)])

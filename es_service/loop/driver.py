@@ -184,7 +184,7 @@ def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
     config, algorithm, generation = search.config, search.algorithm, state.generation + 1
     begun = state.search
     if generation == 0:
-        points = [make_centre(config, 0, one.centre_D, state.observations, one) for one in begun.centres]
+        points = [make_centre(config, 0, centre.centre_D, state.observations, centre) for centre in begun.centres]
         return Proposal(0, begun, {}, (), points, ())
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
@@ -262,7 +262,7 @@ def _step(
     block_pairs = config.compute.gradient_block_pairs
     if isinstance(config.search, PopulationConfig) and config.search.step_gate:
         gradients, agreements = halves(evaluator, generation, weights, block_pairs)
-        asks = [replace(ask, rate=ask.rate * one) for ask, one in zip(asks, agreements, strict=True)]
+        asks = [replace(ask, rate=ask.rate * agreement) for ask, agreement in zip(asks, agreements, strict=True)]
     else:
         gradients = estimate_gradients(evaluator, generation, weights, block_pairs)
     clock.lap("seconds_gradient")

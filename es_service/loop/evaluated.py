@@ -43,20 +43,20 @@ class Evaluated:
 
     def points(self, rows: Sequence[int]) -> list[Centre]:
         """What was evaluated, with its observation statistics, in arrays that are not parts of others."""
-        found: dict[int, Centre] = {}
+        points: dict[int, Centre] = {}
         first = 0
         for subject in self.subjects:
             end = first + (1 if isinstance(subject, Centre) else len(subject.parameters_N_D))
             here = [row for row in rows if first <= row < end]
             if isinstance(subject, Centre):
-                found |= dict.fromkeys(here, subject)
+                points |= dict.fromkeys(here, subject)
             elif here:
-                found |= zip(here, subject.policies([row - first for row in here]), strict=True)
+                points |= zip(here, subject.policies([row - first for row in here]), strict=True)
             first = end
-        return [found[row] for row in rows]
+        return [points[row] for row in rows]
 
     def point(self, row: int) -> Centre:
-        """One of them."""
+        """One point."""
         return self.points([row])[0]
 
 
@@ -112,24 +112,24 @@ def policies_asked(
     config: RunConfig, task: TaskSpec, generation: int, asks: Iterable[Ask | PolicyAsk]
 ) -> list[PolicyWork]:
     """The policies among what a search asks for."""
-    found: list[PolicyWork] = []
+    policies: list[PolicyWork] = []
     for asked in asks:
         if isinstance(asked, PolicyAsk):
             statistics = no_statistics(len(asked.parameters_N_D), task.observation_size)
             if asked.observation_mean_N_O is not None and asked.observation_std_N_O is not None:
                 statistics = asked.observation_mean_N_O, asked.observation_std_N_O
-            found.append(
+            policies.append(
                 policy_work(
                     asked.parameters_N_D,
                     statistics,
                     config.search.evaluation_episodes,
                     seed=config.seed,
                     generation=generation,
-                    ask=len(found),
+                    ask=len(policies),
                     traces=True,
                 )
             )
-    return found
+    return policies
 
 
 def in_ask_order(
@@ -149,14 +149,14 @@ def in_ask_order(
         centres: number of centres of the search.
         fitness_weight: weight of fitness in the state.
     """
-    found: list[Evaluated] = []
+    parts: list[Evaluated] = []
     of_centres, of_policies, index = enumerate(new_centres), enumerate(policies), centres
     for asked in asks:
         if isinstance(asked, Ask):
             number, (point, evaluation, population) = next(of_centres)
             resets = seed, 0, number, NO_POLICY
             update_norm = norm(point.parameters_D - asked.centre_D)
-            found.append(
+            parts.append(
                 _one(asked.centre, point, evaluation, resets, asked.fitness_weight, population, update_norm=update_norm)
             )
             continue
@@ -167,20 +167,20 @@ def in_ask_order(
         index_N, none_N = np.arange(index, index + count), np.full(count, np.nan)
         steps_N = results.steps.sum(axis=1, dtype=np.int64)
         weight_N = np.full(count, float(fitness_weight))
-        found.append(Evaluated((work,), index_N, results, reset_N_4, weight_N, none_N, none_N, steps_N))
+        parts.append(Evaluated((work,), index_N, results, reset_N_4, weight_N, none_N, none_N, steps_N))
         index += count
-    return _joined(found)
+    return _joined(parts)
 
 
 def initial_centres(
     points: Iterable[Centre], evaluations: Iterable[EpisodesResult], config: RunConfig, fitness_weight: float
 ) -> Evaluated:
     """The initial centres, which have no populations; the episodes of each begin with a chunk of its own."""
-    episodes, found = config.search.evaluation_episodes, []
+    episodes, parts = config.search.evaluation_episodes, []
     for index, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
         resets = config.seed, first_episode(index, episodes), 0, NO_POLICY
-        found.append(_one(index, point, evaluation, resets, fitness_weight))
-    return _joined(found)
+        parts.append(_one(index, point, evaluation, resets, fitness_weight))
+    return _joined(parts)
 
 
 def _one(
@@ -213,13 +213,13 @@ def _joined(parts: Sequence[Evaluated]) -> Evaluated:
     if len(parts) == 1:
         return parts[0]
     columns = {
-        name: np.concatenate([getattr(one, name) for one in parts])
+        name: np.concatenate([getattr(part, name) for part in parts])
         for name in Evaluated.__dataclass_fields__
         if name not in ("subjects", "evaluation")
     }
     return Evaluated(
-        subjects=[subject for one in parts for subject in one.subjects],
-        evaluation=joined([one.evaluation for one in parts]),
+        subjects=[subject for part in parts for subject in part.subjects],
+        evaluation=joined([part.evaluation for part in parts]),
         **columns,
     )
 

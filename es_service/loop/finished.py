@@ -57,7 +57,7 @@ class Finished:
     def failures(self) -> Sequence[str]:
         """Texts that name its failed episodes, as far as the rollouts know more of them."""
         results = [*self.evaluations.members, self.updated.evaluated.evaluation]  # policies are in both
-        return list(dict.fromkeys(text for one in results for text in one.failures))
+        return list(dict.fromkeys(text for result in results for text in result.failures))
 
 
 def finish(
@@ -79,7 +79,7 @@ def finish(
     """
     generation, learned, evaluated = proposal.generation, updated.search, updated.evaluated
     results, per_member = evaluated.evaluation, search.config.task.episodes_per_member
-    episodes = sum(one.fitness.size for one in evaluations.populations) * per_member
+    episodes = sum(population.fitness.size for population in evaluations.populations) * per_member
     cell_N = None if learned.map is None else learned.map.cells_with(generation, evaluated.index_N)
     state = RunState(
         generation=generation,
@@ -102,7 +102,7 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
     state, before, proposal, updated = finished.state, finished.before, finished.proposal, finished.updated
     evaluated, told, cell_N, results = updated.evaluated, updated.told, finished.cell_N, updated.evaluated.evaluation
     table = evaluated_table(evaluated, search.task, cell_N, proposal.start_cells, updated.novelty_N)
-    at = fittest(told)  # the history's row is about this one
+    at = fittest(told)  # subject of the history's row
     shown = int(evaluated.index_N[at])
     row: HistoryRow = {
         "generation": state.generation,

@@ -109,13 +109,13 @@ def evaluate_populations(
         around(centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
-    found = _evaluate(EpisodesResult, evaluator, [*asked, *(one.work for one in policies)], meanwhile)
-    trained, of_policies = found[: len(asked)], found[len(asked) :]
+    answers = _evaluate(EpisodesResult, evaluator, [*asked, *(policy_work.work for policy_work in policies)], meanwhile)
+    trained, of_policies = answers[: len(asked)], answers[len(asked) :]
     moments = [result.moments for results in trained for result in results if result.moments is not None]
     return (
         [joined(results, count) for results, count in zip(trained, pairs, strict=True)],
         moments,
-        [policy_episodes(one, results) for one, results in zip(policies, of_policies, strict=True)],
+        [policy_episodes(policy_work, results) for policy_work, results in zip(policies, of_policies, strict=True)],
     )
 
 
@@ -140,8 +140,8 @@ def evaluate_centres(
         if resets == "by_chunk":
             start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
         asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
-    found = _evaluate(EpisodesResult, evaluator, asked)
-    return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in found]
+    answers = _evaluate(EpisodesResult, evaluator, asked)
+    return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in answers]
 
 
 def first_episode(centre: int, episodes: int) -> int:
@@ -168,9 +168,10 @@ def estimate_gradients(
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
             chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
         asked.append(around(NO_CENTRE, chunks))
-    found = _evaluate(GradientResult, evaluator, asked)
+    answers = _evaluate(GradientResult, evaluator, asked)
     return [
-        tree_sum(results) * np.float32(1.0 / weights_P.size) for results, weights_P in zip(found, weights, strict=True)
+        tree_sum(results) * np.float32(1.0 / weights_P.size)
+        for results, weights_P in zip(answers, weights, strict=True)
     ]
 
 
@@ -184,16 +185,19 @@ def halves(
     """
     parts = []
     for is_first in (True, False):
-        half = [np.where((np.arange(one.size) < one.size // 2) == is_first, one, np.float32(0.0)) for one in weights]
+        half = [
+            np.where((np.arange(weights_P.size) < weights_P.size // 2) == is_first, weights_P, np.float32(0.0))
+            for weights_P in weights
+        ]
         parts.append(estimate_gradients(evaluator, generation, half, block_pairs))
     pairs = list(zip(*parts, strict=True))
-    return [first_D + second_D for first_D, second_D in pairs], [_agreement(*one) for one in pairs]
+    return [first_D + second_D for first_D, second_D in pairs], [_agreement(*pair) for pair in pairs]
 
 
 def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
     first, second, both = (
-        float(np.sum(np.multiply(one, other, dtype=np.float64)))
-        for one, other in ((first_D, first_D), (second_D, second_D), (first_D, second_D))
+        float(np.sum(np.multiply(left_D, right_D, dtype=np.float64)))
+        for left_D, right_D in ((first_D, first_D), (second_D, second_D), (first_D, second_D))
     )
     length = math.sqrt(first) * math.sqrt(second)
     return max(0.0, both / length) if length > 0.0 else 0.0
@@ -206,12 +210,12 @@ def _evaluate(
     meanwhile: Callable[[], object] | None = None,
 ) -> list[list[Result]]:
     """The results of each ask's chunks; all are computed side by side."""
-    work = [one for of_ask in asked for one in of_ask]
+    work = [subject_chunk for of_ask in asked for subject_chunk in of_ask]
     results = evaluator.evaluate(work) if meanwhile is None else evaluate_beside(evaluator, work, meanwhile)
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
-    found = iter(checked)
-    return [list(islice(found, len(work))) for work in asked]
+    remaining = iter(checked)
+    return [list(islice(remaining, len(work))) for work in asked]
 
 
 def tell(algorithm: Algorithm, state: SearchState, told: Sequence[CentreEvaluation]) -> SearchState:
@@ -248,12 +252,12 @@ def entered(
     if state.map is None or cell_N is None:
         return {}
     filled = set(state.map.cell_N.tolist()) if state.elites else set()
-    found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
+    elites = {cell: elite for cell, elite in state.elites.items() if cell in filled}
     rows = np.flatnonzero(cell_N != EMPTY).tolist()
     for row, point in zip(rows, points(rows), strict=True):
         assert trace_N_T_B is not None, "an evaluation has a trace"
-        found[int(cell_N[row])] = make_elite(point, trace_N_T_B[row].copy())
-    return found
+        elites[int(cell_N[row])] = make_elite(point, trace_N_T_B[row].copy())
+    return elites
 
 
 def better(best: Best, told: CentreEvaluations, point: Callable[[int], Centre]) -> Best:

@@ -204,8 +204,8 @@ def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
     Args:
         populations: fitness is NaN for invalid members, which only these have; empty for generation 0.
     """
-    fitness_N = np.concatenate([np.zeros(0, np.float32), *(one.fitness.ravel() for one in populations)])
-    returns_N = np.concatenate([np.zeros(0, np.float32), *(one.returns.ravel() for one in populations)])
+    fitness_N = np.concatenate([np.zeros(0, np.float32), *(population.fitness.ravel() for population in populations)])
+    returns_N = np.concatenate([np.zeros(0, np.float32), *(population.returns.ravel() for population in populations)])
     columns: HistoryRow = {"invalid_members": int(np.isnan(fitness_N).sum())}
     for quantity, values in (("fitness", fitness_N), ("return", returns_N)):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
@@ -226,14 +226,14 @@ def quartiles(values_N: NDArray[np.float64]) -> list[float]:
     if not values_N.size:
         return [math.nan] * 5
     sorted_N = np.sort(values_N).tolist()
-    found = []
+    values = []
     for numerator in range(5):
         at = numerator / 4 * (len(sorted_N) - 1)
         below = min(int(at), len(sorted_N) - 1)
         low, high, share = sorted_N[below], sorted_N[min(below + 1, len(sorted_N) - 1)], at - below
         # Interpolated from the nearer of the two, as NumPy does.
-        found.append(low + (high - low) * share if share < 0.5 else high - (high - low) * (1.0 - share))
-    return found
+        values.append(low + (high - low) * share if share < 0.5 else high - (high - low) * (1.0 - share))
+    return values
 
 
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN

@@ -208,13 +208,15 @@ def map_from_parts(parts: Parts) -> BehaviourMap | None:
     empty = empty_map(
         geometry_from_arrays(parts[GEOMETRY_PART]), counts_samples="counts_samples" in parts[GEOMETRY_PART]
     )
-    found = {int(name.removeprefix(CELL_PREFIX)): part for name, part in parts.items() if name.startswith(CELL_PREFIX)}
-    if not found:
+    entries = {
+        int(name.removeprefix(CELL_PREFIX)): part for name, part in parts.items() if name.startswith(CELL_PREFIX)
+    }
+    if not entries:
         return empty
-    cells = sorted(found, key=lambda cell: int(found[cell]["order"]))
+    cells = sorted(entries, key=lambda cell: int(entries[cell]["order"]))
 
     def column(name: str, kind: type[Any]) -> np.ndarray:
-        return np.array([found[cell][name] for cell in cells], kind)
+        return np.array([entries[cell][name] for cell in cells], kind)
 
     order_N = column("order", np.int64)
     return BehaviourMap(

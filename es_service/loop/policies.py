@@ -40,7 +40,7 @@ class PolicyWork:
         ]
 
     def policy(self, number: int) -> Centre:
-        """One of them."""
+        """One policy."""
         return self.policies([number])[0]
 
     def _parameters(self, numbers: Sequence[int]) -> list[FloatArray]:
@@ -110,11 +110,11 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
 
     traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
     flat = joined([replace(result, trace_T_B=None) for result in results])
-    found = replace(each(by_policy, flat), trace_T_B=np.concatenate(traces) if traces else None)
+    reshaped = replace(each(by_policy, flat), trace_T_B=np.concatenate(traces) if traces else None)
     if not flat.of_steps:
-        return found
-    row_K = _rows(by_policy(np.cumsum(flat.steps) - flat.steps), found.steps)
-    return replace(found, of_steps={name: array[row_K] for name, array in flat.of_steps.items()})
+        return reshaped
+    row_K = _rows(by_policy(np.cumsum(flat.steps) - flat.steps), reshaped.steps)
+    return replace(reshaped, of_steps={name: array[row_K] for name, array in flat.of_steps.items()})
 
 
 def _rows(first_N_E: np.ndarray, count_N_E: np.ndarray) -> np.ndarray:

@@ -15,31 +15,32 @@ ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
 
 def each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> EpisodesResult:
     """A function of the arrays of results with equal names, array by array; without moments and outputs of steps."""
-    traces = [one.trace_T_B for one in results if one.trace_T_B is not None]
+    traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
     return EpisodesResult(
-        *(change(*(getattr(one, name) for one in results)) for name in ARRAYS),
+        *(change(*(getattr(result, name) for result in results)) for name in ARRAYS),
         moments=None,
         trace_T_B=change(*traces) if len(traces) == len(results) else None,
-        outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
-        failures=tuple(text for one in results for text in one.failures),
+        outputs={name: change(*(result.outputs[name] for result in results)) for name in results[0].outputs},
+        failures=tuple(text for result in results for text in result.failures),
     )
 
 
 def joined(results: Sequence[EpisodesResult], count: int | None = None) -> EpisodesResult:
     """Results along the first axis, one after another, of which the first `count` are kept; without moments."""
-    found = each(lambda *arrays: np.concatenate(arrays)[:count], *results)
+    combined = each(lambda *arrays: np.concatenate(arrays)[:count], *results)
     if not (names := results[0].of_steps):
-        return found
-    rows = int(found.steps.sum(dtype=np.int64))
+        return combined
+    rows = int(combined.steps.sum(dtype=np.int64))
     return replace(
-        found, of_steps={name: np.concatenate([one.of_steps[name] for one in results])[:rows] for name in names}
+        combined,
+        of_steps={name: np.concatenate([result.of_steps[name] for result in results])[:rows] for name in names},
     )
 
 
 def one_of(results: EpisodesResult, index: int) -> EpisodesResult:
     """The results at an index of the first axis, such as those of one policy [E] from those of all [N, E]."""
-    found = replace(each(lambda array: array[index], results), failures=())  # they do not say which one is theirs
+    part = replace(each(lambda array: array[index], results), failures=())  # they do not name their index
     if not results.of_steps:
-        return found
+        return part
     first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[index]))
-    return replace(found, of_steps={name: array[first : first + rows] for name, array in results.of_steps.items()})
+    return replace(part, of_steps={name: array[first : first + rows] for name, array in results.of_steps.items()})

@@ -16,34 +16,34 @@ ADDED = GradientResult(None, blocks=0)
 
 
 def with_neighbours_added(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[ChunkResult]:
-    """The results of chunks, of which those of gradient blocks that form a node of the tree are one sum.
+    """The results of chunks; those of gradient blocks that form a node of the tree are one sum.
 
     The sum is at the place of the node's first block, and the others are ADDED. Sums may have been formed before.
     """
-    found = list(results)
+    summed = list(results)
     open_nodes: list[int] = []  # places of neighbouring nodes of the same population
     for place, (_, chunk) in enumerate(work):
-        result = found[place]
+        result = summed[place]
         if not isinstance(chunk, GradientChunk) or not isinstance(result, GradientResult):
             open_nodes = []
             continue
         if not result.blocks:
             continue
-        if open_nodes and not _follows(work[open_nodes[-1]][1], found[open_nodes[-1]], chunk):
+        if open_nodes and not _follows(work[open_nodes[-1]][1], summed[open_nodes[-1]], chunk):
             open_nodes = []
         open_nodes.append(place)
         while len(open_nodes) > 1:
             left, right = open_nodes[-2:]
-            sums, more = found[left], found[right]
+            sums, more = summed[left], summed[right]
             assert isinstance(sums, GradientResult)
             assert isinstance(more, GradientResult)
             if sums.blocks != more.blocks or work[left][1].chunk_id % (2 * sums.blocks):
                 break
             assert sums.sum_D is not None
             assert more.sum_D is not None
-            found[left], found[right] = GradientResult(sums.sum_D + more.sum_D, 2 * sums.blocks), ADDED
+            summed[left], summed[right] = GradientResult(sums.sum_D + more.sum_D, 2 * sums.blocks), ADDED
             open_nodes.pop()
-    return found
+    return summed
 
 
 def _follows(chunk: object, result: ChunkResult, later: GradientChunk) -> bool:

@@ -76,25 +76,25 @@ def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes,
     for name, parameters_D in needed.items():
         if name not in kept:
             steps = _steps(name, kept) if parameters_D.nbytes >= LEAST_BYTES else None
-            for one, given in ({name: parameters_D} if steps is None else steps).items():
-                kept.add(one, parameters_D.nbytes)
-                sent[one] = given
+            for parent_name, given in ({name: parameters_D} if steps is None else steps).items():
+                kept.add(parent_name, parameters_D.nbytes)
+                sent[parent_name] = given
     kept.needed(needed)
     return sent
 
 
 def apart(parents: Mapping[bytes, FloatArray | Origin]) -> list[dict[bytes, FloatArray | Origin]]:
     """Parents in their order, as several messages: each that travels by itself has its own, which may be large."""
-    found: list[dict[bytes, FloatArray | Origin]] = []
+    messages: list[dict[bytes, FloatArray | Origin]] = []
     before = False
     for name, given in parents.items():
         is_origin = isinstance(given, Origin)
         if is_origin and before:
-            found[-1][name] = given
+            messages[-1][name] = given
         else:
-            found.append({name: given})
+            messages.append({name: given})
         before = is_origin
-    return found
+    return messages
 
 
 def _steps(name: bytes, kept: KeptParents[int]) -> dict[bytes, Origin] | None:
@@ -103,13 +103,13 @@ def _steps(name: bytes, kept: KeptParents[int]) -> dict[bytes, Origin] | None:
     steps: dict[bytes, Origin] = {}
     waiting = [name]
     while waiting:
-        one = waiting.pop(0)
-        if one in kept:
+        policy_name = waiting.pop(0)
+        if policy_name in kept:
             continue
-        if (origin := origin_of(one)) is None or (len(steps) == MOST_STEPS and one not in steps):
+        if (origin := origin_of(policy_name)) is None or (len(steps) == MOST_STEPS and policy_name not in steps):
             return None
-        steps.pop(one, None)  # what descends from it comes after it
-        steps[one] = origin
+        steps.pop(policy_name, None)  # what descends from it comes after it
+        steps[policy_name] = origin
         waiting += origin.x, origin.y
     return dict(reversed(steps.items()))
 
@@ -123,12 +123,12 @@ def with_parents(work: Sequence[Work], kept: KeptParents[FloatArray]) -> list[Wo
     Raises:
         LackingError: the worker lacks some.
     """
-    if not (found := list(_recipes_in(work))):
+    if not (all_recipes := list(_recipes_in(work))):
         return list(work)
-    if any(name not in kept for recipes in found for name in recipes.names):
+    if any(name not in kept for recipes in all_recipes for name in recipes.names):
         raise LackingError
     subjects = {id(subject): _with(subject, lambda recipes: recipes.complete(kept)) for subject, _ in work}
-    kept.needed(name for recipes in found for name in recipes.names)
+    kept.needed(name for recipes in all_recipes for name in recipes.names)
     return [(subjects[id(subject)], chunk) for subject, chunk in work]
 
 

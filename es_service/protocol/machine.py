@@ -56,10 +56,10 @@ def computed_on(driver: Mapping[str, Any], workers: Collection[str]) -> dict[str
 def is_mixed(platforms: Iterable[Mapping[str, Any]]) -> bool:
     """Whether generations were computed on several platforms or with several versions of the code, or one generation by
     workers on several platforms. Code that was not recorded, as in old runs, is not compared."""
-    found = list(platforms)
-    machines = {platform_text(without_code(one)) for one in found}
-    codes = {platform_text(one[CODE]) for one in found if CODE in one}
-    return max(len(machines), len(codes)) > 1 or any(len(one.get("workers", ())) > 1 for one in found)
+    records = list(platforms)
+    machines = {platform_text(without_code(record)) for record in records}
+    codes = {platform_text(record[CODE]) for record in records if CODE in record}
+    return max(len(machines), len(codes)) > 1 or any(len(record.get("workers", ())) > 1 for record in records)
 
 
 def without_code(platform: Mapping[str, Any]) -> dict[str, Any]:

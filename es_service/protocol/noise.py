@@ -94,7 +94,7 @@ def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int,
     """
     domains = domain if isinstance(domain, tuple) else (domain,)
     # There is always an axis of domains, because NumPy warns when a scalar wraps around, but not when an array does.
-    state = np.array([_prefix(seed, one, generation) for one in domains], np.uint64)
+    state = np.array([_prefix(seed, each_domain, generation) for each_domain in domains], np.uint64)
     state = state.reshape(-1, *[1] * max(map(np.ndim, ids), default=0))
     for field in ids:
         state = _mix64((state ^ np.asarray(field, np.uint64)) + _GOLDEN)
@@ -187,7 +187,7 @@ def normals(keys: Keys, count: int) -> NDArray[np.float32]:
     for first in range(0, len(key_N_4), rows):
         part = slice(first, first + rows)
         key = key_N_4[part].T[..., None]
-        x, y = (one[: len(key_N_4[part])] for one in (x_R_C, y_R_C))
+        x, y = (buffer[: len(key_N_4[part])] for buffer in (x_R_C, y_R_C))
         np.add(weyl_C, key[0], out=x)
         x ^= np.right_shift(x, _16, out=y)
         x *= _MUL_1

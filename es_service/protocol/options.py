@@ -40,11 +40,11 @@ def declared_options(owner: object) -> tuple[dict[str, Option], list[str]]:
     given: Any = getattr(owner, "options", {})
     if not isinstance(given, Mapping):
         return {}, [f"options = {given!r} is not a mapping from names to options"]
-    found: dict[str, Any] = {
-        name: choice(*one) if isinstance(one, tuple) and one else one for name, one in given.items()
+    options: dict[str, Any] = {
+        name: choice(*option) if isinstance(option, tuple) and option else option for name, option in given.items()
     }
-    wrong = [f"option {name!r} {problem}" for name, one in found.items() if (problem := _problem(name, one))]
-    return ({}, wrong) if wrong else (found, [])
+    wrong = [f"option {name!r} {problem}" for name, option in options.items() if (problem := _problem(name, option))]
+    return ({}, wrong) if wrong else (options, [])
 
 
 def _problem(name: object, option: object) -> str:

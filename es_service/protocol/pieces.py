@@ -47,14 +47,14 @@ def pieces_of(work: Work, most: int) -> list[Work]:
 
 def whole(work: Work, results: Sequence[ChunkResult]) -> ChunkResult:
     """The result of a chunk from those of its pieces."""
-    episodes = [one for one in results if isinstance(one, EpisodesResult)]
+    episodes = [result for result in results if isinstance(result, EpisodesResult)]
     if len(results) == 1 or len(episodes) < len(results):
         return results[0]
-    traces = [one.trace_T_B for one in episodes if one.trace_T_B is not None]
-    found = joined([replace(one, trace_T_B=None) for one in episodes])
+    traces = [result.trace_T_B for result in episodes if result.trace_T_B is not None]
+    combined = joined([replace(result, trace_T_B=None) for result in episodes])
     if not traces:
-        return found
-    return replace(found, trace_T_B=np.concatenate(traces) if isinstance(work[1], PolicyChunk) else traces[0])
+        return combined
+    return replace(combined, trace_T_B=np.concatenate(traces) if isinstance(work[1], PolicyChunk) else traces[0])
 
 
 def together(work: Sequence[Work], most: int) -> list[Work]:
@@ -64,26 +64,26 @@ def together(work: Sequence[Work], most: int) -> list[Work]:
     The slots of policies with more episodes, or with observation statistics, stay as they are.
     """
     groups: list[list[Work]] = []
-    for one in work:
-        if groups and _goes_on(groups[-1], one, most):
-            groups[-1].append(one)
+    for subject_chunk in work:
+        if groups and _goes_on(groups[-1], subject_chunk, most):
+            groups[-1].append(subject_chunk)
         else:
-            groups.append([one])
+            groups.append([subject_chunk])
     sent: dict[int, Subject] = {}  # by `id`, since chunks with the same policies share them
-    found = []
+    merged = []
     for group in groups:
-        (subject, chunk), recipes = group[0], [_recipes(one) for one, _ in group]
+        (subject, chunk), recipes = group[0], [_recipes(its_subject) for its_subject, _ in group]
         if id(subject) not in sent:
             sent[id(subject)] = subject
             if isinstance(subject, Policies) and (first := recipes[0]) is not None:
-                parent_N_2 = np.concatenate([one.parent_N_2 for one in recipes if one is not None])
-                key_N_4 = np.concatenate([one.key_N_4 for one in recipes if one is not None])
+                parent_N_2 = np.concatenate([part.parent_N_2 for part in recipes if part is not None])
+                key_N_4 = np.concatenate([part.key_N_4 for part in recipes if part is not None])
                 whole = replace(first, parent_N_2=parent_N_2, key_N_4=key_N_4).part(slice(None))
                 sent[id(subject)] = replace(subject, parameters_N_D=whole)
         if isinstance(chunk, PolicyChunk) and len(group) > 1:
-            chunk = replace(chunk, count=sum(len(one) for one in recipes if one is not None))
-        found.append((sent[id(subject)], chunk))
-    return found
+            chunk = replace(chunk, count=sum(len(part) for part in recipes if part is not None))
+        merged.append((sent[id(subject)], chunk))
+    return merged
 
 
 def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
@@ -118,22 +118,24 @@ def separated(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[Chun
     """The results of each chunk from those of a work item as it was sent."""
     if len(results) == len(work):
         return list(results)
-    found: list[ChunkResult] = []
+    chunk_results: list[ChunkResult] = []
     for result in results:
         ends = [0]
         while isinstance(result, EpisodesResult) and ends[-1] < len(result.fitness):
-            subject, chunk = work[len(found) + len(ends) - 1]
+            subject, chunk = work[len(chunk_results) + len(ends) - 1]
             assert isinstance(subject, Policies)
             assert isinstance(chunk, PolicyChunk)
             ends.append(ends[-1] + len(slots(subject, chunk)[0]))
-        found += [_rows(result, *place) for place in pairwise(ends)] if isinstance(result, EpisodesResult) else [result]
-    return found
+        chunk_results += (
+            [_rows(result, *place) for place in pairwise(ends)] if isinstance(result, EpisodesResult) else [result]
+        )
+    return chunk_results
 
 
 def _rows(result: EpisodesResult, first: int, end: int) -> EpisodesResult:
     """The results of some slots; the first have the failures of all."""
-    found = replace(each(lambda array: array[first:end], result), failures=() if first else result.failures)
+    part = replace(each(lambda array: array[first:end], result), failures=() if first else result.failures)
     if not result.of_steps:
-        return found
+        return part
     start, stop = (int(result.steps[:at].sum(dtype=np.int64)) for at in (first, end))
-    return replace(found, of_steps={name: array[start:stop] for name, array in result.of_steps.items()})
+    return replace(part, of_steps={name: array[start:stop] for name, array in result.of_steps.items()})

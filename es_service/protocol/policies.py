@@ -23,8 +23,8 @@ POLICIES_TOGETHER = 8 * POLICY_SLOTS
 
 @dataclass(frozen=True)
 class Policies:
-    """Policies that travel together, once to each worker that runs chunks of them: up to POLICY_SLOTS, or with chunks
-    that are several in one those of these."""
+    """Policies that travel together, once to each worker that runs chunks of them: up to POLICY_SLOTS, or those of
+    several chunks that are sent as one."""
 
     first: int
     """Number of the first of them among the policies of their ask."""
@@ -66,7 +66,7 @@ class PolicyChunk:
     """Number of the chunk among those of the policies that it is sent with."""
     first: int = 0
     count: int = POLICY_SLOTS
-    """The first of its slots that is wanted, and how many are, if the chunk is a piece of one, or several in one
+    """First wanted slot and number of wanted slots, if this is a piece of a chunk, or several chunks in one
     (`protocol.pieces`)."""
 
 

@@ -40,11 +40,11 @@ class PolicySpec:
         A recurrent cell has two, whose inputs are those of the cell followed by the memory: its two gates, and then the
         candidate for the next memory. The layer after the cell has the memory as its input.
         """
-        found, last = list(zip(self.widths[:-2], self.widths[1:-1], strict=True)), self.widths[-2]
+        layers, last = list(zip(self.widths[:-2], self.widths[1:-1], strict=True)), self.widths[-2]
         if self.memory:
-            found += [(last + self.memory, 2 * self.memory), (last + self.memory, self.memory)]
+            layers += [(last + self.memory, 2 * self.memory), (last + self.memory, self.memory)]
             last = self.memory
-        return (*found, (last, self.outputs))
+        return (*layers, (last, self.outputs))
 
     @property
     def parameters(self) -> int:

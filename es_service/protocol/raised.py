@@ -68,14 +68,14 @@ def why_not_imported(module: str, error: Exception) -> str:
 def users_error(error: BaseException, *names: str) -> str:
     """What the user's code raised, with its frames in the user's files; empty if it was not the user's code."""
     packages = {path.partition(":")[0].partition(".")[0] for path in map(user_path, names) if path}
-    texts, is_users, one = [], False, error
-    while one is not None:
-        frames = _frames(one, packages)
+    texts, is_users, exception = [], False, error
+    while exception is not None:
+        frames = _frames(exception, packages)
         is_users |= bool(frames)
-        if frames or one is error:
-            text = "\n".join([_sentence(one), *frames, *_notes(one)])
-            texts.append(text if one is error else f"caused by {text}")
-        one = one.__cause__ or (None if one.__suppress_context__ else one.__context__)
+        if frames or exception is error:
+            text = "\n".join([_sentence(exception), *frames, *_notes(exception)])
+            texts.append(text if exception is error else f"caused by {text}")
+        exception = exception.__cause__ or (None if exception.__suppress_context__ else exception.__context__)
     return "\n".join(texts) if is_users else ""
 
 

@@ -119,7 +119,7 @@ class Recipes:
         """In which way these are no recipes of finite policies with some number of parameters; empty if they are."""
         count = len(self.parent_N_2)
         facts = _facts_of(self.parents)
-        for form in dict.fromkeys(one.form for one in facts):
+        for form in dict.fromkeys(parent_facts.form for parent_facts in facts):
             if form != f"float32 ({parameters},)":
                 return f"have a parent that is {form}; must be float32 ({parameters},)"
         indices = self.parent_N_2
@@ -132,7 +132,7 @@ class Recipes:
         if not all(0.0 <= sigma < np.inf for sigma in self.rule):
             return f"have the standard deviations {tuple(self.rule)}; must be finite and not negative"
         iso, line = (LARGEST_NOISE * sigma for sigma in self.rule)
-        largest = float(np.max([one.largest for one in facts]))
+        largest = float(np.max([parent_facts.largest for parent_facts in facts]))
         # No difference of parents may overflow either. NaN is not less than anything.
         if not (1.0 + 2.0 * max(1.0, line)) * largest + iso < LARGEST_FLOAT:
             return f"make policies that may not be finite, of parents with values up to {largest:g}"
@@ -141,7 +141,7 @@ class Recipes:
 
 def explicit(policies: Sequence[FloatArray | Recipes]) -> FloatArray:
     """The parameters of policies, [N, D], some of which are made of recipes."""
-    return np.concatenate([one.made() if isinstance(one, Recipes) else one for one in policies])
+    return np.concatenate([group.made() if isinstance(group, Recipes) else group for group in policies])
 
 
 class Origin(NamedTuple):
@@ -156,9 +156,11 @@ class Origin(NamedTuple):
 
 def recipes_again(origins: Sequence[Origin], parents: Mapping[bytes, FloatArray]) -> Recipes:
     """The recipes of policies by their origins, all of which have the same rule."""
-    index = {name: at for at, name in enumerate(dict.fromkeys(name for one in origins for name in (one.x, one.y)))}
-    parent_N_2 = np.array([(index[one.x], index[one.y]) for one in origins])
-    key_N_4 = np.stack([one.key_4 for one in origins])
+    index = {
+        name: at for at, name in enumerate(dict.fromkeys(name for origin in origins for name in (origin.x, origin.y)))
+    }
+    parent_N_2 = np.array([(index[origin.x], index[origin.y]) for origin in origins])
+    key_N_4 = np.stack([origin.key_4 for origin in origins])
     return Recipes(origins[0].rule, tuple(index), tuple(parents[name] for name in index), parent_N_2, key_N_4)
 
 
@@ -198,7 +200,7 @@ def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray
     Raises:
         TypeError: a parent is no array.
     """
-    return Recipes(rule, tuple(one.name for one in _facts_of(parents)), tuple(parents), parent_N_2, key_N_4)
+    return Recipes(rule, tuple(facts.name for facts in _facts_of(parents)), tuple(parents), parent_N_2, key_N_4)
 
 
 def unvaried(policies: Sequence[FloatArray]) -> Recipes:
@@ -233,10 +235,10 @@ _KNOWN: dict[int, _Facts] = {}
 
 def _facts_of(parents: Sequence[FloatArray]) -> list[_Facts]:
     """The facts of arrays, most of which are known."""
-    known = [_KNOWN.get(id(one)) for one in parents]
+    known = [_KNOWN.get(id(parent)) for parent in parents]
     return [
-        facts if facts is not None and facts.of() is one else _facts(one)
-        for one, facts in zip(parents, known, strict=True)
+        facts if facts is not None and facts.of() is parent else _facts(parent)
+        for parent, facts in zip(parents, known, strict=True)
     ]
 
 

@@ -86,9 +86,9 @@ def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicySpec, *, gpu: bool,
         gpu: whether the workers use GPUs.
         here: whether the workers run on this machine; what other machines can run is not known.
     """
-    fits = {name: one for name, one in rollouts.items() if one.runs_on_gpus or not gpu}
-    able = [name for name, one in fits.items() if not why_not(one, task, policy, here=here)]
-    return able[-1] if able else next(name for name, one in rollouts.items() if task.kind in one.task_kinds)
+    fits = {name: rollout for name, rollout in rollouts.items() if rollout.runs_on_gpus or not gpu}
+    able = [name for name, rollout in fits.items() if not why_not(rollout, task, policy, here=here)]
+    return able[-1] if able else next(name for name, rollout in rollouts.items() if task.kind in rollout.task_kinds)
 
 
 def why_not(rollout: Rollout, task: TaskSpec, policy: PolicySpec, *, here: bool) -> str:

@@ -63,8 +63,8 @@ def driver_sources(algorithm: str) -> dict[str, str]:
 def user_sources(path: str) -> dict[str, str]:
     """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
     own = user_path(path)
-    found = {one.source: one.sha256 for one in modules_of(own).user.values()} if own else {}
-    return found | _version(LIBRARY) if path.startswith(f"{LIBRARY}:") else found
+    sources = {module.source: module.sha256 for module in modules_of(own).user.values()} if own else {}
+    return sources | _version(LIBRARY) if path.startswith(f"{LIBRARY}:") else sources
 
 
 def _version(package: str) -> dict[str, str]:
@@ -136,13 +136,13 @@ def is_user_code(name: str) -> bool:
 @cache
 def _package_sources(*packages: str) -> dict[str, str]:
     """All Python files in packages of this project, which are importable here."""
-    found: dict[str, str] = {}
+    sources: dict[str, str] = {}
     for package in packages:
         spec = importlib.util.find_spec(package)
         for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
             for file in filter(Path.is_file, folder.rglob("*.py")):  # editors leave links that lead nowhere
-                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = sha256(file.read_bytes())
-    return found
+                sources["/".join((*package.split("."), *file.relative_to(folder).parts))] = sha256(file.read_bytes())
+    return sources
 
 
 class UserModule(NamedTuple):
@@ -179,7 +179,7 @@ def modules_of(path: str) -> Modules:
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return Modules({}, frozenset(), is_installed=False)
     is_shared = os.path.basename(place) in SHARED_FOLDERS
-    found: dict[str, UserModule] = {}
+    modules: dict[str, UserModule] = {}
     others: set[str] = set()
     seen: set[str] = set()
     wanted = [name]
@@ -201,8 +201,8 @@ def modules_of(path: str) -> Modules:
             wanted += needs
             parts = spec.name.split(".")
             above = (".".join(parts[:count]) for count in range(1, len(parts)))
-            found[spec.name] = UserModule(file, source, sha256(content), frozenset((*needs, *above)))
-    return Modules(found, frozenset(others - sys.stdlib_module_names), is_shared)
+            modules[spec.name] = UserModule(file, source, sha256(content), frozenset((*needs, *above)))
+    return Modules(modules, frozenset(others - sys.stdlib_module_names), is_shared)
 
 
 def _chain(name: str) -> Iterator[importlib.machinery.ModuleSpec]:
@@ -249,15 +249,15 @@ def _imports(content: bytes, package: str) -> tuple[str, ...]:
         tree = ast.parse(content)
     except (SyntaxError, ValueError):
         return ()  # its import is going to fail
-    found: list[str] = []
+    names: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package.rsplit(".", node.level - 1)[0] if node.level > 1 else package
             base = ".".join(filter(None, (above if node.level else "", node.module)))
-            found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-    return tuple(filter(None, found))
+            names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return tuple(filter(None, names))
 
 
 def sha256(content: bytes) -> str:

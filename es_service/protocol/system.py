@@ -89,8 +89,8 @@ def mounts_of_linux(mountinfo: str) -> Iterator[tuple[Path, str]]:
 
 def mounts_of_macos(said: str) -> Iterator[tuple[Path, str]]:
     """`mounts` from what the command `mount` of macOS prints: `//me@host/share on /Volumes/share (smbfs, nodev)`."""
-    for found in re.finditer(r"^.* on (/.*) \(([^,)]+)[^()]*\)$", said, re.MULTILINE):
-        yield Path(found[1]), found[2].lower()
+    for match in re.finditer(r"^.* on (/.*) \(([^,)]+)[^()]*\)$", said, re.MULTILINE):
+        yield Path(match[1]), match[2].lower()
 
 
 def _said(*command: str) -> str:

@@ -33,11 +33,11 @@ def import_user_module(path: str) -> ModuleType:
         sys.path.append(os.getcwd())  # a console script does not search its working folder
     with _ONE_AT_A_TIME:
         importlib.invalidate_caches()  # a file may be newer than what Python knows of its folder
-        found = modules_of(path).user
-        old = {name: sys.modules[name] for name in _outdated(found)}
+        modules = modules_of(path).user
+        old = {name: sys.modules[name] for name in _outdated(modules)}
         for outdated in old:
             _remove(outdated)
-        sys.meta_path.insert(0, finder := _Finder(found))
+        sys.meta_path.insert(0, finder := _Finder(modules))
         try:
             return importlib.import_module(name)
         except BaseException:
@@ -76,14 +76,14 @@ def _restore(name: str, module: ModuleType) -> None:
         setattr(sys.modules[package], child, module)
 
 
-def _outdated(found: Mapping[str, UserModule]) -> set[str]:
+def _outdated(modules: Mapping[str, UserModule]) -> set[str]:
     """Names of the imported modules that have changed since, and of those that need one of them."""
-    outdated = {name for name, own in found.items() if name in sys.modules and not _is_same(sys.modules[name], own)}
-    needed = {name for own in found.values() for name in own.needs}
-    outdated |= {name for name in needed & sys.modules.keys() - found.keys() if _is_gone(sys.modules[name])}
+    outdated = {name for name, own in modules.items() if name in sys.modules and not _is_same(sys.modules[name], own)}
+    needed = {name for own in modules.values() for name in own.needs}
+    outdated |= {name for name in needed & sys.modules.keys() - modules.keys() if _is_gone(sys.modules[name])}
     more = outdated
     while more:
-        more = {name for name in found.keys() & sys.modules.keys() - outdated if found[name].needs & outdated}
+        more = {name for name in modules.keys() & sys.modules.keys() - outdated if modules[name].needs & outdated}
         outdated |= more
     return outdated
 
@@ -106,8 +106,8 @@ def _is_gone(module: ModuleType) -> bool:
 class _Finder:
     """Finds a user's modules, and has them loaded with `_Loader`."""
 
-    def __init__(self, found: Mapping[str, UserModule]) -> None:
-        self._files = {name: own.file for name, own in found.items() if own.file.suffix == ".py"}
+    def __init__(self, modules: Mapping[str, UserModule]) -> None:
+        self._files = {name: own.file for name, own in modules.items() if own.file.suffix == ".py"}
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """The spec of a module, None if it is not one of them."""

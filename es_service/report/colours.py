@@ -18,7 +18,7 @@ LEVELS = 32
 
 
 def _levels() -> tuple[str, ...]:
-    anchors = np.array([[int(one[i : i + 2], 16) for i in (0, 2, 4)] for one in _VIRIDIS], float)
+    anchors = np.array([[int(colour[i : i + 2], 16) for i in (0, 2, 4)] for colour in _VIRIDIS], float)
     places = np.linspace(0, len(anchors) - 1, LEVELS)
     channels = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
     return tuple("#" + "".join(f"{round(value):02x}" for value in rgb) for rgb in zip(*channels, strict=True))

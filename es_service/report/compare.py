@@ -93,7 +93,7 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
         ConfigError: a key is unknown, or the runs are of different tasks.
     """
     constants = [run.constants for run in runs]
-    known = sorted({key for one in constants for key in one})
+    known = sorted({key for settings in constants for key in settings})
     for key in keys:
         if key not in known:
             raise ConfigError(
@@ -102,22 +102,24 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
                 value=key,
                 suggestion=nearest(key, known),
             )
-    differing = [key for key in known if len({in_line(one.get(key)) for one in constants}) > 1]
+    differing = [key for key in known if len({in_line(settings.get(key)) for settings in constants}) > 1]
     _refuse_other_tasks(runs, [key for key in differing if key not in keys or key == "task.environment"])
     chosen = list(keys) or _explaining(constants, differing)
-    found: dict[str, list[RunData]] = {}
+    groups: dict[str, list[RunData]] = {}
     for run in runs:
         values = [in_line(run.constants.get(key)) for key in chosen]
         name = values[0] if chosen == ["search.algorithm"] else ", ".join(map("{} {}".format, chosen, values))
-        found.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
-    return [Group(name, tuple(members)) for name, members in found.items()]
+        groups.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
+    return [Group(name, tuple(members)) for name, members in groups.items()]
 
 
 def swept_keys(runs: Sequence[RunData]) -> list[str]:
     """Settings in which the runs of one sweep differ, also options of their task: whoever swept them compares them."""
     constants = [run.constants for run in runs]
-    known = dict.fromkeys(key for one in constants for key in one)
-    return _explaining(constants, [key for key in known if len({in_line(one.get(key)) for one in constants}) > 1])
+    known = dict.fromkeys(key for settings in constants for key in settings)
+    return _explaining(
+        constants, [key for key in known if len({in_line(settings.get(key)) for settings in constants}) > 1]
+    )
 
 
 def _refuse_other_tasks(runs: Sequence[RunData], differing: Sequence[str]) -> None:
@@ -137,8 +139,10 @@ def _explaining(constants: Sequence[Mapping[str, Any]], differing: Sequence[str]
     own = [key for key in differing if not key.startswith(OWN_TO_A_RUN) and key not in LEFT_OPEN]
     if "search.algorithm" in own:
         by_algorithm: dict[str, set[str]] = {}
-        for one in constants:
-            by_algorithm.setdefault(one["search.algorithm"], set()).add(str([in_line(one.get(key)) for key in own]))
+        for settings in constants:
+            by_algorithm.setdefault(settings["search.algorithm"], set()).add(
+                str([in_line(settings.get(key)) for key in own])
+            )
         if all(len(values) == 1 for values in by_algorithm.values()):
             return ["search.algorithm"]
     return own
@@ -148,11 +152,11 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
     """A chart for each column that all runs have, and the places of its points on an axis of AXES, [K].
 
     A curve ends where the first run of its group ends, so that every point is over all of its runs. It is empty if that
-    is before another run begins; so the charts are the same ones on every axis.
+    is before another run begins; so every axis has the same charts.
     """
     last = max(float(np.nanmax(run.history[axis])) for group in groups for run in group.runs)
     x_K = np.linspace(0.0, last, POINTS)
-    found = []
+    chart_list = []
     for column, (title, note, percent) in COLUMNS.items():
         runs = [run for group in groups for run in group.runs]
         if not all(column in run.history for run in runs) or not any(
@@ -165,8 +169,8 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             interval = group.interval(y_R_K)
             range_K = None if interval is None else (interval[0], interval[1])
             lines.append(Line(group.name, column, np.median(y_R_K, axis=0), range_K))
-        found.append(Chart(title, note, tuple(lines), None, percent))
-    return found, x_K
+        chart_list.append(Chart(title, note, tuple(lines), None, percent))
+    return chart_list, x_K
 
 
 def quartiles_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -195,7 +199,7 @@ def common_threshold(runs: Sequence[RunData]) -> float | None:
 
 def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]:
     """The final values of each group; `threshold`: fitness from which a run counts as solved, None: no run does."""
-    found = []
+    summary_list = []
     for group in groups:
         last = {
             column: np.array([[run.last(column)] for run in group.runs], float)
@@ -209,7 +213,7 @@ def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]
                 break
             reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
             steps += [float(run.history["env_steps"][reached[0]])] if reached.size else []
-        found.append(
+        summary_list.append(
             Summary(
                 group,
                 {column: _quartiles(y_R_1[:, 0].tolist()) for column, y_R_1 in last.items()},
@@ -218,7 +222,7 @@ def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]
                 _quartiles(steps),
             )
         )
-    return found
+    return summary_list
 
 
 def _quartiles(values: Sequence[float]) -> Quartiles:

@@ -82,8 +82,8 @@ def comparison_sections(
 
 
 def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
-    found = compare.summaries(groups, threshold)
-    best = max(found, key=lambda one: one.values["best_fitness"].median)
+    summaries = compare.summaries(groups, threshold)
+    best = max(summaries, key=lambda summary: summary.values["best_fitness"].median)
     value = number(best.values["best_fitness"].median)
     runs = facts.count(len(best.group.runs), "run")
     known = _interval(best, "best_fitness")
@@ -96,8 +96,8 @@ def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
             f"({runs}{interval})"
         )
     if threshold is not None:
-        solved = sum(one.solved for one in found)
-        total = sum(len(one.group.runs) for one in found)
+        solved = sum(summary.solved for summary in summaries)
+        total = sum(len(summary.group.runs) for summary in summaries)
         sentence += f"; {solved} of {total} runs reach {number(threshold)}"
     return f"{sentence}."
 
@@ -111,17 +111,19 @@ def _problems(runs: Sequence[RunData]) -> list[Markup]:
 
 
 def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
-    found = compare.summaries(groups, threshold)
-    columns = [column for column in HEADS if all(column in one.values for one in found)]
+    summaries = compare.summaries(groups, threshold)
+    columns = [column for column in HEADS if all(column in summary.values for summary in summaries)]
     solved = () if threshold is None else (f"reach {number(threshold)}", "million steps until then")
     rows = []
-    for one in found:
-        runs = len(one.group.runs)
-        cells = [_shown(one.values[column], column, _interval(one, column)) for column in columns]
+    for summary in summaries:
+        runs = len(summary.group.runs)
+        cells = [_shown(summary.values[column], column, _interval(summary, column)) for column in columns]
         reached = (
-            (f"{one.solved} of {runs}", _shown(one.steps, "env_steps") if one.solved else "none") if solved else ()
+            (f"{summary.solved} of {runs}", _shown(summary.steps, "env_steps") if summary.solved else "none")
+            if solved
+            else ()
         )
-        rows.append((one.group.name, _seeds_of(one.group), *reached, *cells))
+        rows.append((summary.group.name, _seeds_of(summary.group), *reached, *cells))
     heads = ("group", "seeds", *solved, *(HEADS[column] for column in columns))
     return Markup(table(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
 
@@ -157,12 +159,12 @@ def _seeds_of(group: Group) -> str:
     return f"{group.seeds}" if group.seeds == runs else f"{group.seeds} in {runs} runs"
 
 
-def _interval(one: Summary, column: str) -> str:
+def _interval(summary: Summary, column: str) -> str:
     """The interval of a median in words; empty if it has none, or no extent."""
-    if column not in one.intervals:
+    if column not in summary.intervals:
         return ""
     scale, _ = UNITS.get(column, (1.0, ""))
-    low, high = (number(scale * value) for value in one.intervals[column])
+    low, high = (number(scale * value) for value in summary.intervals[column])
     return "" if low == high else f"interval {low} to {high}"
 
 

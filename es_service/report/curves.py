@@ -29,15 +29,15 @@ class Drawn(NamedTuple):
 
 def draw_charts(charts: Sequence[Chart], x_axes: Mapping[str, NDArray[np.float64]]) -> list[Drawn]:
     """Charts whose points have the places of `x_axes` (column of X_AXES -> [K]), the same ones on every axis."""
-    found = []
+    drawn = []
     for chart in charts:
         figure, axes = draw({column: (chart, x_K) for column, x_K in x_axes.items()})
         texts = [
             f"generation {x_axes['generation'][k]:,.0f}: {values_text(chart, k)}"
             for k in range(len(x_axes["generation"]))
         ]
-        found.append(Drawn(figure, {"axes": axes, "texts": {"": texts}}))
-    return found
+        drawn.append(Drawn(figure, {"axes": axes, "texts": {"": texts}}))
+    return drawn
 
 
 def draw(chart_on: Mapping[str, tuple[Chart, NDArray[np.float64]]]) -> tuple[Markup, dict[str, list[float]]]:
@@ -132,14 +132,14 @@ def _step(values: list[float]) -> float:
 def line_path(frame: Frame, x_K: NDArray[np.float64], y_K: NDArray[np.float64]) -> str:
     """Path through points, with gaps where a value is missing; a point between two gaps is drawn as a dot."""
     across, down = frame.across(x_K), frame.down(y_K)
-    found, drawing = [], False
+    commands, drawing = [], False
     for x, y in zip(across, down, strict=True):
         if not (np.isfinite(x) and np.isfinite(y)):
             drawing = False
             continue
-        found.append(f"L{x:.1f} {y:.1f}" if drawing else f"M{x:.1f} {y:.1f}h0")
+        commands.append(f"L{x:.1f} {y:.1f}" if drawing else f"M{x:.1f} {y:.1f}h0")
         drawing = True
-    return "".join(found)
+    return "".join(commands)
 
 
 def area(frame: Frame, x_K: NDArray[np.float64], low_K: NDArray[np.float64], high_K: NDArray[np.float64]) -> str:

@@ -118,9 +118,9 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     """
 
     driver = lock_holder(folder)  # read before the history, so that the last row is not missed
-    found = read_sound(folder, _kept if paths else _kept_without_paths)
-    data = run_data(folder, found, driver)
-    if not digest or driver is not None or found.newest is None:
+    sound = read_sound(folder, _kept if paths else _kept_without_paths)
+    data = run_data(folder, sound, driver)
+    if not digest or driver is not None or sound.newest is None:
         return data
     problems = list(data.problems)
     return replace(data, digest=_digest(folder, problems), problems=tuple(problems))
@@ -179,17 +179,17 @@ def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
     return {name: np.ma.filled(columns.pop(name).astype(np.float64, copy=False), np.nan) for name in list(columns)}
 
 
-def _map(found: SoundRun, problems: list[str]) -> BehaviourMap | None:
-    map_ = map_from_parts(found.parts)
-    if map_ is None and found.meta.constants.get("map.enabled") and found.generation is not None:
+def _map(sound: SoundRun, problems: list[str]) -> BehaviourMap | None:
+    map_ = map_from_parts(sound.parts)
+    if map_ is None and sound.meta.constants.get("map.enabled") and sound.generation is not None:
         problems.append("the behaviour map cannot be shown, because its geometry is damaged")
     return map_
 
 
-def _paths(found: SoundRun) -> dict[int, NDArray[np.float32]]:
+def _paths(sound: SoundRun) -> dict[int, NDArray[np.float32]]:
     return {
         int(part.removeprefix(ELITE_PREFIX)): arrays[TRACE]
-        for part, arrays in found.parts.items()
+        for part, arrays in sound.parts.items()
         if part.startswith(ELITE_PREFIX)
     }
 

@@ -78,11 +78,11 @@ def _side(start: Places, end: Places, place: Places) -> Places:
 @cache
 def _closed(walls: tuple[Segment, ...], clearance: float) -> tuple[Segment, ...]:
     """Walls, and lines across the openings between them that are too narrow for an episode to pass."""
-    wall_W_2_2, found = np.array(walls, np.float64), list(walls)
+    wall_W_2_2, segments = np.array(walls, np.float64), list(walls)
     for x, y in wall_W_2_2.reshape(-1, 2).tolist():
         near_W_2 = _nearest(np.array([x, y]), wall_W_2_2).tolist()
-        found += [((x, y), (a, b)) for a, b in near_W_2 if 0.0 < math.hypot(a - x, b - y) < 2.0 * clearance]
-    return tuple(found)
+        segments += [((x, y), (a, b)) for a, b in near_W_2 if 0.0 < math.hypot(a - x, b - y) < 2.0 * clearance]
+    return tuple(segments)
 
 
 def _way_round(
@@ -115,7 +115,7 @@ def _ways_between_corners(
     low_2, high_2 = np.array(bounds, np.float64).T
     wall_W_2_2 = np.array(walls, np.float64)
     margin = max(clearance, MARGIN * float((high_2 - low_2).max()))
-    found = []
+    places = []
     for number, (first_2, last_2) in enumerate(wall_W_2_2):
         beyond_2 = margin * (last_2 - first_2) / np.linalg.norm(last_2 - first_2)
         aside_2 = beyond_2[::-1] * (-1.0, 1.0)
@@ -124,10 +124,10 @@ def _ways_between_corners(
             place_2 = end_2 + side * aside_2
             apart_W = np.linalg.norm(_nearest(place_2, others) - place_2, axis=1)
             if (low_2 <= place_2).all() and (place_2 <= high_2).all() and (apart_W >= clearance).all():
-                found.append(place_2)
-    if not found:
+                places.append(place_2)
+    if not places:
         return np.zeros((0, 2)), np.zeros((0, 0)), np.zeros((0, 0), np.int32)
-    place_C_2 = np.array(found)
+    place_C_2 = np.array(places)
     straight_C_C = np.linalg.norm(place_C_2[:, None] - place_C_2, axis=-1)
     straight_C_C[crosses(place_C_2[:, None], place_C_2, walls)] = np.inf
     return place_C_2, *shortest_path(straight_C_C, return_predecessors=True)

@@ -33,8 +33,8 @@ def verdict(data: RunData) -> str:
     # A run of generation 0 alone has evaluated random weights and has not searched.
     alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
     episodes = data.constants["search.evaluation_episodes"]
-    found = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
-    sentence = f"{alone}{found} over {count(episodes, 'evaluation episode')} (selected, not certified)"
+    clause = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
+    sentence = f"{alone}{clause} over {count(episodes, 'evaluation episode')} (selected, not certified)"
     target = data.status.limits.get("target_fitness")
     if target is not None:
         reached = "reaches" if fitness >= target else "does not reach"
@@ -88,11 +88,11 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
 
 def _objectives(data: RunData) -> list[tuple[str, str]]:
     """How many centres have explored, as (label, text), where each either explores or exploits."""
-    found = objectives(weights(data.centres)[1])
-    if not found.are_separate:
+    counts = objectives(weights(data.centres)[1])
+    if not counts.are_separate:
         return []
-    exploring, exploiting = (f"{100 * part / found.centres:.1f} %" for part in (found.exploring, found.exploiting))
-    return [("centres", f"{exploring} of {found.centres:,} explored, {exploiting} exploited")]
+    exploring, exploiting = (f"{100 * part / counts.centres:.1f} %" for part in (counts.exploring, counts.exploiting))
+    return [("centres", f"{exploring} of {counts.centres:,} explored, {exploiting} exploited")]
 
 
 def provenance(data: RunData) -> list[tuple[str, str]]:
@@ -136,8 +136,8 @@ def fault_sentence(found: list[Fault]) -> str:
     """The faults of a run in one sentence."""
     if not found:
         return "No worker was lost and no chunk had to be sent again."
-    lost, retries = sum(one.lost_workers for one in found), sum(one.retries for one in found)
-    were, sent = ("was" if one == 1 else "were" for one in (lost, retries))
+    lost, retries = sum(fault.lost_workers for fault in found), sum(fault.retries for fault in found)
+    were, sent = ("was" if total == 1 else "were" for total in (lost, retries))
     return (
         f"{count(lost, 'worker')} {were} lost and replaced, and {count(retries, 'chunk')} {sent} sent again, in "
         f"{count(len(found), 'generation')}. No result depends on it."

@@ -42,32 +42,32 @@ def write_figures(
     Raises:
         ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
     """
-    found: dict[str, Callable[[Any], Any]] = {}
+    drawings: dict[str, Callable[[Any], Any]] = {}
     for column in compare.COLUMNS:
         if all(column in run.history for run in runs):
-            found[column] = lambda figure, column=column: plots.curves(
+            drawings[column] = lambda figure, column=column: plots.curves(
                 list(runs), figure.subplots(), column, group_by=keys
             )
     mapped = [run for run in runs if run.map is not None and run.map.size and len(run.names) <= 2]
     if len(runs) == 1:
         if mapped:
-            found["behaviour_map"] = lambda figure: _map(mapped[0], figure.subplots())
+            drawings["behaviour_map"] = lambda figure: _map(mapped[0], figure.subplots())
             if len(mapped[0].names) == 2:
-                found["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
-        found["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
+                drawings["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
+        drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
     else:
-        found["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
+        drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
         if mapped:
             colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
             for index, group in enumerate(compare.grouped(runs, keys)):
                 if (run := compare.median_run(group)) in mapped:
-                    found[f"behaviour_map_{index}"] = lambda figure, run=run, name=group.name: _map(
+                    drawings[f"behaviour_map_{index}"] = lambda figure, run=run, name=group.name: _map(
                         run, figure.subplots(), colours, name
                     )
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, draw in found.items():
+        for name, draw in drawings.items():
             figure = empty_figure()
             draw(figure)
             for kind in ("svg", "png"):

@@ -127,11 +127,11 @@ def _svg(content: list[Markup], width: float, height: float, class_: str = "map 
 def _rectangles(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> list[Markup]:
     assert isinstance(map_.geometry, Grid)
     across, down = (place(edges) for place, edges in zip((frame.across, frame.down), map_.geometry.edges, strict=True))
-    found = []
+    rectangles = []
     for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
         i, j = map_.geometry.index_of(cell)
-        found.append(_rectangle(cell, colour, across[i], down[j + 1], across[i + 1], down[j]))
-    return found
+        rectangles.append(_rectangle(cell, colour, across[i], down[j + 1], across[i + 1], down[j]))
+    return rectangles
 
 
 def _rectangle(cell: int, colour: int, left: float, top: float, right: float, bottom: float) -> Markup:
@@ -156,14 +156,14 @@ def _voronoi(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> li
             image[:, axis] = 2 * side - image[:, axis]
             mirrored.append(image)
     diagram = Voronoi(np.concatenate(mirrored))
-    found = []
+    polygons = []
     for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
         corners = low_2 + diagram.vertices[diagram.regions[diagram.point_region[cell]]] * (high_2 - low_2)
         points = " ".join(
             f"{x:.1f},{y:.1f}" for x, y in zip(frame.across(corners[:, 0]), frame.down(corners[:, 1]), strict=True)
         )
-        found.append(Markup(f'<polygon points="{points}" fill="{SCALE[colour]}" data-c="{cell}"/>'))
-    return found
+        polygons.append(Markup(f'<polygon points="{points}" fill="{SCALE[colour]}" data-c="{cell}"/>'))
+    return polygons
 
 
 def _bars(data: RunData, level_N: NDArray[np.int64], colours: Range) -> Markup:
@@ -254,27 +254,27 @@ def path_lines(data: RunData) -> dict[str, Any]:
     map_ = data.map
     assert map_ is not None
     known = [cell for cell in map_.cell_N.tolist() if cell in data.paths]
-    found: dict[str, Any] = {"order": known, "points": 0, "lines": 1, "detours": {}, "paths": ""}
+    script_data: dict[str, Any] = {"order": known, "points": 0, "lines": 1, "detours": {}, "paths": ""}
     if not known:
-        return found
+        return script_data
     path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
     points = path_N_T_B.shape[1]
     if len(map_.geometry.bounds) == 2:
         frame = floor.plan_frame(map_.geometry.bounds)
         inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
         lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
-        found["detours"] = {
+        script_data["detours"] = {
             str(cell): [[at, _way(frame, places)] for at, places in around.items()]
             for cell, inside_T_B in zip(known, inside_N_T_B, strict=True)
             if (around := detours(inside_T_B, data.task, map_.geometry.bounds))
         }
-        return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}
+        return script_data | {"points": points, "paths": packed(TENTHS * lines, "int16")}
     time, shown = _path_frame(data), min(len(data.names), PAIRED_DIMENSIONS)
     low_B, high_B = np.array(data.bounds).T
     share = np.clip((path_N_T_B - low_B) / (high_B - low_B), -0.02, 1.02)[..., :shown]
     x = np.broadcast_to(time.across(np.linspace(*time.x, points))[:, None], share.shape)
     lines = np.stack([x, time.down(share)], axis=-1).transpose(0, 2, 1, 3)
-    return found | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}
+    return script_data | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}
 
 
 def _path_frame(data: RunData) -> Frame:

@@ -61,7 +61,7 @@ def packed(values: ArrayLike, dtype: str) -> str:
 def table(rows: Iterable[tuple[object, ...]], head: tuple[str, ...] = (), class_: str = "fields") -> Markup:
     """A table; the first cell of each row is its heading."""
     top = tag("thead", tag("tr", *(tag("th", text, scope="col") for text in head))) if head else None
-    body = [tag("tr", tag("th", first, scope="row"), *(tag("td", one) for one in rest)) for first, *rest in rows]
+    body = [tag("tr", tag("th", first, scope="row"), *(tag("td", cell) for cell in rest)) for first, *rest in rows]
     return tag("div", tag("table", top, tag("tbody", *body), class_=class_), class_="scroll")
 
 
@@ -88,7 +88,7 @@ class Frame(NamedTuple):
 
 def spread(values: Iterable[ArrayLike], margin: float = 0.05) -> tuple[float, float]:
     """(low, high) around all finite values, with a margin; (0, 1) if there are none."""
-    finite = np.concatenate([np.ravel(np.asarray(one, np.float64)) for one in values] or [np.zeros(0)])
+    finite = np.concatenate([np.ravel(np.asarray(array, np.float64)) for array in values] or [np.zeros(0)])
     finite = finite[np.isfinite(finite)]
     if not finite.size:
         return 0.0, 1.0

@@ -34,10 +34,10 @@ def _page(data: RunData) -> str:
     problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
     sections, points = [tag("section", *said, *problems, id="what")], []
     if data.history["generation"].size:
-        charts = [one for one in series.charts(data.history, data.centres) if one.title in SHOWN]
+        charts = [chart for chart in series.charts(data.history, data.centres) if chart.title in SHOWN]
         drawn = curves.draw_charts(charts, {"generation": series.x_axes(data.history)["generation"]})
-        points = [one.points for one in drawn]
-        shown = [one.figure for one in drawn]
+        points = [chart.points for chart in drawn]
+        shown = [chart.figure for chart in drawn]
         if data.map is not None and data.map.size:
             figure, explanation, _ = maps.draw_map(data)
             bar = maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))

@@ -40,7 +40,7 @@ def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | Non
         sections[REPLAY] = replays["section"]
         scripts |= replays["scripts"]
     libraries = list(replays["libraries"]) if replays is not None else []
-    return document(run_title(data), [one for one in sections.values() if one], scripts, libraries)
+    return document(run_title(data), [html for html in sections.values() if html], scripts, libraries)
 
 
 def run_title(data: RunData) -> str:
@@ -64,8 +64,8 @@ def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Ma
             "time": _time(data),
             "faults": _faults(data),
         }
-        if found := _parameters(data):
-            sections["parameters"] = found
+        if parameters := _parameters(data):
+            sections["parameters"] = parameters
     return sections, scripts
 
 
@@ -112,7 +112,7 @@ def axis_choice(axes: Mapping[str, str]) -> Markup:
 
 def _head(data: RunData) -> Markup:
     changed = changed_settings(data.meta.config, data.task)
-    rows = [(one.key, one.value, one.default or "unknown") for one in changed]
+    rows = [(setting.key, setting.value, setting.default or "unknown") for setting in changed]
     settings = table(rows, ("setting", "value", "default"), "settings") if rows else tag("p", "None.")
     problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
     return tag(
@@ -132,7 +132,7 @@ def _head(data: RunData) -> Markup:
 
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     drawn = curves.draw_charts(series.charts(data.history, data.centres), series.x_axes(data.history))
-    scripts["charts"] = [one.points for one in drawn]
+    scripts["charts"] = [chart.points for chart in drawn]
     generations = data.history["generation"].size
     together = series.groups(generations)[0]
     grouped = None
@@ -143,7 +143,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     return section(
         "Curves",
         axis_choice(series.X_AXES),
-        tag("div", *(one.figure for one in drawn), class_="charts"),
+        tag("div", *(chart.figure for chart in drawn), class_="charts"),
         grouped,
         id_="curves",
     )
@@ -160,7 +160,7 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
     names = {cell: row[0] for cell, row in view.cells["rows"].items()}
     scripts["map"] = view.cells
     if evaluate is not None:
-        scripts["map"] |= maps.path_lines(data) | {"evaluate": {cell: evaluate(one) for cell, one in names.items()}}
+        scripts["map"] |= maps.path_lines(data) | {"evaluate": {cell: evaluate(name) for cell, name in names.items()}}
     detours = data.task.walls if evaluate is None else scripts["map"]["detours"]
     fittest = str(int(data.map.cell_N[data.map.fitness_N.argmax()]))
     scripts["map"]["first"] = fittest
@@ -187,23 +187,23 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
 
 
 def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
-    found = clouds.cloud(data)
-    if found is None:
+    cloud = clouds.cloud(data)
+    if cloud is None:
         return section("Evaluated centres", tag("p", "No valid centre was evaluated."), id_="centres")
-    scripts["cloud"] = found.points
-    last = len(found.points["stops"]) - 1
+    scripts["cloud"] = cloud.points
+    last = len(cloud.points["stops"]) - 1
     slider = Markup(f'<input type="range" id="until" min="0" max="{last}" value="{last}" aria-label="generation">')
     return section(
         "Evaluated centres",
-        tag("p", found.explanation, class_="note"),
+        tag("p", cloud.explanation, class_="note"),
         tag(
             "div",
-            found.figure,
+            cloud.figure,
             tag(
                 "div",
                 tag("h3", "Until a generation"),
                 tag("div", slider, tag("span", id="until-text", class_="readout"), class_="slider"),
-                maps.colour_bar(found.colours),
+                maps.colour_bar(cloud.colours),
             ),
             class_="columns",
         ),
@@ -231,10 +231,12 @@ def _time(data: RunData) -> Markup:
 
 
 def _faults(data: RunData) -> Markup:
-    found = facts.faults(data)
-    rows = [(f"{one.generation:,}", f"{one.lost_workers:,}", f"{one.retries:,}") for one in found[:MOST_FAULTS]]
+    faults = facts.faults(data)
+    rows = [
+        (f"{fault.generation:,}", f"{fault.lost_workers:,}", f"{fault.retries:,}") for fault in faults[:MOST_FAULTS]
+    ]
     more = None
-    if len(found) > MOST_FAULTS:
-        more = tag("p", f"{len(found) - MOST_FAULTS:,} more generations are not listed.", class_="note")
+    if len(faults) > MOST_FAULTS:
+        more = tag("p", f"{len(faults) - MOST_FAULTS:,} more generations are not listed.", class_="note")
     listed = table(rows, ("generation", "workers lost", "chunks sent again"), "numbers") if rows else None
-    return section("Faults survived", tag("p", facts.fault_sentence(found)), listed, more, id_="faults")
+    return section("Faults survived", tag("p", facts.fault_sentence(faults)), listed, more, id_="faults")

@@ -152,16 +152,16 @@ def curves(
 
     Raises ConfigError for another column or axis, and for runs of different tasks.
     """
-    found = [_data(one) for one in (runs if isinstance(runs, list | tuple) else [runs])]
-    for name, allowed in ((column, found[0].history), (against, X_AXES)):
-        if name not in allowed or any(column not in one.history for one in found):
+    all_data = [_data(source) for source in (runs if isinstance(runs, list | tuple) else [runs])]
+    for name, allowed in ((column, all_data[0].history), (against, X_AXES)):
+        if name not in allowed or any(column not in data.history for data in all_data):
             raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
-    groups = compare.grouped(found, group_by)
-    last = max(float(run.history[against][-1]) for run in found)
+    groups = compare.grouped(all_data, group_by)
+    last = max(float(run.history[against][-1]) for run in all_data)
     x_K = np.linspace(0.0, last, compare.POINTS)
     for index, group in enumerate(groups):
         style = {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
-        if len(found) == 1:
+        if len(all_data) == 1:
             axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
             continue
         low_K, median_K, high_K = compare.quartiles_at(group, column, against, x_K)

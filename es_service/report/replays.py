@@ -52,11 +52,11 @@ def replay_section(
             "author, ask for the replay by its name: best, certified, or a cell."
         )
     try:
-        replays, found = record(run, best=best, cells=cells, certified=certified)
+        replays, recorded = record(run, best=best, cells=cells, certified=certified)
     except ServiceError as error:
         return _no_replay(f"No episode could be recorded on this machine: {error.sentence}")
-    solid = bool(found.shapes) and all(one.recording.poses_T_L_7 is not None for one in replays)
-    scripts = {"replay": _solid(data, replays, found) if solid else _flat(data, replays)}
+    solid = bool(recorded.shapes) and all(replay.recording.poses_T_L_7 is not None for replay in replays)
+    scripts = {"replay": _solid(data, replays, recorded) if solid else _flat(data, replays)}
     libraries = [asset("three.bundle.js")] if solid else []
     return {
         "section": _section(data, replays, solid=solid),
@@ -73,35 +73,37 @@ def _no_replay(text: str) -> Mapping[str, Any]:
     }
 
 
-def _title(one: Replay) -> str:
+def _title(replay: Replay) -> str:
     names = {"best": "best centre", CERTIFIED: "certified policy"}
-    name = names.get(one.candidate.name, f"cell {one.candidate.name}")
-    return f"{name}: fitness {number(one.recording.fitness)} in this episode"
+    name = names.get(replay.candidate.name, f"cell {replay.candidate.name}")
+    return f"{name}: fitness {number(replay.recording.fitness)} in this episode"
 
 
-def _notes(one: Replay, hidden: str | None) -> Markup:
+def _notes(replay: Replay, hidden: str | None) -> Markup:
     """Which episode is shown, and how it compares with what the run has stored of it."""
-    stored, shown = one.stored, number(one.recording.fitness)
-    seen = f"{one.recording.returns_T.size - 1:,} steps, fitness {shown}"
-    mean = f"(mean of all its evaluation episodes: {number(one.candidate.stored_fitness)})"
+    stored, shown = replay.stored, number(replay.recording.fitness)
+    seen = f"{replay.recording.returns_T.size - 1:,} steps, fitness {shown}"
+    mean = f"(mean of all its evaluation episodes: {number(replay.candidate.stored_fitness)})"
     if stored is None:
-        if np.isfinite(one.candidate.stored_fitness):
+        if np.isfinite(replay.candidate.stored_fitness):
             text = "The run does not have the address of this policy's evaluation episodes, as runs of versions before "
             text += f"0.12, so this is another episode of the policy: {seen} {mean}."
         else:
             text = "This run is a fork whose settings have changed the meaning of fitness, so earlier evaluations of "
             text += f"the policy do not count. This is an episode with the settings of this run: {seen}."
         return tag("p", text, class_="note episode", hidden=hidden)
-    text = f"First evaluation episode of the policy, of generation {one.candidate.generation:,}: {seen} {mean}."
+    text = f"First evaluation episode of the policy, of generation {replay.candidate.generation:,}: {seen} {mean}."
     if stored.certification is not None:
         text = f"Episode {stored.request.episode:,} of certification {stored.certification}, which is the one of "
-        text += f"median fitness: {seen} (mean of all its episodes: {number(one.candidate.stored_fitness)})."
-    if one.is_the_stored:
+        text += f"median fitness: {seen} (mean of all its episodes: {number(replay.candidate.stored_fitness)})."
+    if replay.is_the_stored:
         same = "Its fitness equals the stored one bit for bit."
         if stored.trace_T_B is not None:
             same = "Its fitness and its path equal the stored ones bit for bit."
         return tag("p", f"{text} {same}", class_="note episode", hidden=hidden)
-    other = f"This is not the stored episode, whose fitness is {stored.fitness!r} instead of {one.recording.fitness!r}."
+    other = (
+        f"This is not the stored episode, whose fitness is {stored.fitness!r} instead of {replay.recording.fitness!r}."
+    )
     if stored.changes:
         why = f"What has changed since it was computed may give other bits: {'; '.join(stored.changes)}."
         return tag("p", f"{text} {other} {why}", class_="note episode", hidden=hidden)
@@ -110,9 +112,9 @@ def _notes(one: Replay, hidden: str | None) -> Markup:
 
 
 def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup:
-    options = [tag("option", _title(one), value=index) for index, one in enumerate(replays)]
+    options = [tag("option", _title(replay), value=index) for index, replay in enumerate(replays)]
     speeds = [tag("option", f"{speed:g} x", value=speed, selected="" if speed == 1 else None) for speed in SPEEDS]
-    longest = max(one.recording.returns_T.size for one in replays) - 1
+    longest = max(replay.recording.returns_T.size for replay in replays) - 1
     scrub = Markup(f'<input type="range" id="scrub" min="0" max="{longest}" value="0" step="1" aria-label="step">')
     # Walls are seen best from afar, a body on its own from nearby.
     follow = Markup(f'<input type="checkbox" id="follow"{"" if data.task.walls else " checked"}>')
@@ -135,7 +137,7 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
         tag("p", id="step", class_="readout"),
         stage,
         tag("div", plan, class_="stage flat", id="plan", hidden="" if solid else None),
-        *(_notes(one, "" if i else None) for i, one in enumerate(replays)),
+        *(_notes(replay, "" if i else None) for i, replay in enumerate(replays)),
         tag(
             "p",
             "Drag to turn; scroll or pinch to zoom; drag with the right button or with two fingers to move.",
@@ -154,17 +156,17 @@ def _labels(data: RunData, replays: Sequence[Replay]) -> tuple[str, str]:
     return (first, others[0]) if others else ("step of the episode", first)
 
 
-def _shows_body(data: RunData, one: Replay) -> bool:
+def _shows_body(data: RunData, replay: Replay) -> bool:
     """Whether the path is that of the first body, because the descriptor is no place on the floor."""
-    return one.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names)
+    return replay.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names)
 
 
-def _plane(data: RunData, one: Replay) -> tuple[np.ndarray, np.ndarray]:
+def _plane(data: RunData, replay: Replay) -> tuple[np.ndarray, np.ndarray]:
     """x and y of a path in the plane: of a body, or the first two dimensions, or one dimension against time."""
-    way_T_B = one.recording.descriptor_T_B
-    if _shows_body(data, one):
-        assert one.recording.poses_T_L_7 is not None
-        return one.recording.poses_T_L_7[:, 0, 0], one.recording.poses_T_L_7[:, 0, 1]
+    way_T_B = replay.recording.descriptor_T_B
+    if _shows_body(data, replay):
+        assert replay.recording.poses_T_L_7 is not None
+        return replay.recording.poses_T_L_7[:, 0, 0], replay.recording.poses_T_L_7[:, 0, 1]
     if way_T_B.shape[1] == 1:
         return np.arange(len(way_T_B), dtype=float), way_T_B[:, 0]
     return way_T_B[:, 0], way_T_B[:, 1]
@@ -173,7 +175,7 @@ def _plane(data: RunData, one: Replay) -> tuple[np.ndarray, np.ndarray]:
 def _frame(data: RunData, replays: Sequence[Replay]) -> Any:
     if floor.is_plan(data.task, data.names):
         return floor.plan_frame(data.bounds)
-    ways = [_plane(data, one) for one in replays]
+    ways = [_plane(data, replay) for replay in replays]
     return floor.plan_frame((spread([x for x, _ in ways]), spread([y for _, y in ways])))
 
 
@@ -181,19 +183,19 @@ def _flat(data: RunData, replays: Sequence[Replay]) -> dict[str, Any]:
     """Paths in tenths of a pixel of the floor plan."""
     frame = _frame(data, replays)
     episodes = []
-    for one in replays:
-        x, y = _plane(data, one)
+    for replay in replays:
+        x, y = _plane(data, replay)
         way = np.stack([frame.across(np.clip(x, *frame.x)), frame.down(np.clip(y, *frame.y))], axis=1)
-        returns = [number(float(value)) for value in one.recording.returns_T]
+        returns = [number(float(value)) for value in replay.recording.returns_T]
         episodes.append({"steps": len(way) - 1, "way": packed(10 * way, "int16"), "returns": returns})
     return {"solid": False, "step_s": PLAIN_STEP_S, "episodes": episodes}
 
 
-def _solid(data: RunData, replays: Sequence[Replay], found: Recordings) -> dict[str, Any]:
+def _solid(data: RunData, replays: Sequence[Replay], recorded: Recordings) -> dict[str, Any]:
     """Poses of all links, and the shapes that move with them."""
     flat = _flat(data, replays)
-    for one, episode in zip(replays, flat["episodes"], strict=True):
-        poses = np.nan_to_num(np.asarray(one.recording.poses_T_L_7, np.float64))
+    for replay, episode in zip(replays, flat["episodes"], strict=True):
+        poses = np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64))
         low, high = poses[..., :3].min(axis=(0, 1)), poses[..., :3].max(axis=(0, 1))
         size = np.maximum(high - low, 1e-6) / 65535.0
         episode |= {
@@ -206,8 +208,8 @@ def _solid(data: RunData, replays: Sequence[Replay], found: Recordings) -> dict[
     assert links is not None
     return flat | {
         "solid": True,
-        "step_s": found.step_s,
+        "step_s": recorded.step_s,
         "links": links.shape[1],
-        "shapes": [shape._asdict() for shape in found.shapes],
+        "shapes": [shape._asdict() for shape in recorded.shapes],
         "goal": None if data.task.goal is None else list(data.task.goal),
     }

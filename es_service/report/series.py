@@ -124,7 +124,7 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
     """The charts of a run that have values, from the columns of its history and of its evaluated centres."""
     ends_K = groups(len(history["generation"]))
     history = {**history, **weight_columns(history["generation"], centres)}
-    found = []
+    chart_list = []
     for spec in _SPECS:
         lines = tuple(
             Line(label, column, thinned(history[column], ends_K, group))
@@ -137,8 +137,8 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
         if spec.band is not None and np.isfinite(history.get(spec.band[1], np.full(1, np.nan))).any():
             label, low, high = spec.band
             band = (label, thinned(history[low], ends_K, "mean"), thinned(history[high], ends_K, "mean"))
-        found.append(Chart(spec.title, spec.note, lines, band, spec.percent))
-    return found
+        chart_list.append(Chart(spec.title, spec.note, lines, band, spec.percent))
+    return chart_list
 
 
 def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Columns:

@@ -86,4 +86,4 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
 
 def _plain(value: Any) -> Any:
     """A value with lists in place of tuples, as JSON has it."""
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

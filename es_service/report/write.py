@@ -69,8 +69,8 @@ def write_report(
     data = read_run(folder)
     if certified is None:
         certified = best and data.certified is not None
-    found = bool(data.history["generation"].size) and (best or certified or bool(cells))
-    replays = replay_section(data, best=best, cells=cells, certified=certified, trusted=trusted) if found else None
+    has_replay = bool(data.history["generation"].size) and (best or certified or bool(cells))
+    replays = replay_section(data, best=best, cells=cells, certified=certified, trusted=trusted) if has_replay else None
     elsewhere = WayOut("report", "write it elsewhere", str(folder), out="FILE")
     page = run_page(data, evaluate or python_call(folder), replays)
     page = write_page(page, Path(out or folder / REPORT), [elsewhere])

@@ -101,7 +101,7 @@ def certify_run(
         for notice in store.notices:
             on_notice(notice)
         config = evaluation_config(run, workers)
-        _measure(config, by)  # refuses a wrong one before workers start
+        _measure(config, by)  # refused before workers start if wrong
         if top is None:
             top = TOP if config.map.enabled else 0
         chosen = candidates(
@@ -117,9 +117,9 @@ def certify_run(
             raise NotInRunError(f"{run.folder}: there is no policy to certify; its map is empty", run=run.folder)
         with _engine(config, on_notice) as engine:
             number = store.next_certification
-            found = _certify(engine, config, _different(chosen), number, episodes, keep, by)
-        store.add_certification([stored(one) for one in found])
-    return found
+            certified = _certify(engine, config, _different(chosen), number, episodes, keep, by)
+        store.add_certification([stored(policy) for policy in certified])
+    return certified
 
 
 def certify(
@@ -165,18 +165,18 @@ def certify(
 def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...], list[str]]]:
     """The stored certifications, each with the names of the results that differ if its episodes are run again, and with
     what has changed in packages, processor and code since it was made, in words."""
-    found = certified_policies(run.folder)
-    if not found:
+    certified = certified_policies(run.folder)
+    if not certified:
         return
     config = evaluation_config(run, workers)
     now = _platform(config)
     with _engine(config) as engine:
-        for one in found:
-            policy = (one.parameters_D, one.observation_mean_O, one.observation_std_O)
-            [result] = _certification_episodes(engine, [policy], one.episodes.count, config.seed, one.number)
-            again, then = arrays_of(kept(result)), arrays_of(one.episodes)
+        for policy in certified:
+            parameters = (policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
+            [result] = _certification_episodes(engine, [parameters], policy.episodes.count, config.seed, policy.number)
+            again, then = arrays_of(kept(result)), arrays_of(policy.episodes)
             equal = {name for name in then if name in again and then[name].tobytes() == again[name].tobytes()}
-            yield one, tuple(name for name in then if name not in equal), changes_since(one.platform, now)
+            yield policy, tuple(name for name in then if name not in equal), changes_since(policy.platform, now)
 
 
 def _certify(
@@ -190,13 +190,13 @@ def _certify(
 ) -> list[Certified]:
     """Select among candidates, then certify those that remain."""
     measure = _measure(config, by)
-    ranked, steps = halved(engine, [one.policy for one in given], config.seed, number, keep, measure)
-    policies, platform = [given[one.index].policy for one in ranked], _platform(config)
+    ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
+    policies, platform = [given[record.index].policy for record in ranked], _platform(config)
     results = _certification_episodes(engine, policies, episodes, config.seed, number)
-    found = []
-    for rank, (one, result) in enumerate(zip(ranked, results, strict=True)):
-        candidate = given[one.index]
-        found.append(
+    certified = []
+    for rank, (record, result) in enumerate(zip(ranked, results, strict=True)):
+        candidate = given[record.index]
+        certified.append(
             Certified(
                 number,
                 rank,
@@ -204,8 +204,8 @@ def _certify(
                 candidate.generation,
                 candidate.stored_fitness,
                 measure,
-                one.mean(measure) if one.count else None,
-                one.count,
+                record.mean(measure) if record.count else None,
+                record.count,
                 len(given),
                 steps,
                 platform,
@@ -213,7 +213,7 @@ def _certify(
                 *candidate.policy,
             )
         )
-    return found
+    return certified
 
 
 def _certification_episodes(
@@ -229,12 +229,16 @@ def _platform(config: RunConfig) -> dict[str, Any]:
 
 def _different(chosen: Sequence[Candidate]) -> list[_Named]:
     """The candidates; of equal policies only the first, since the best centre is often an elite as well."""
-    found: dict[tuple[bytes, ...], _Named] = {}
-    for one in chosen:
-        policy = (one.policy.parameters_D, one.policy.observation_mean_O, one.policy.observation_std_O)
+    different: dict[tuple[bytes, ...], _Named] = {}
+    for candidate in chosen:
+        policy = (
+            candidate.policy.parameters_D,
+            candidate.policy.observation_mean_O,
+            candidate.policy.observation_std_O,
+        )
         key = tuple(array.tobytes() for array in policy)
-        found.setdefault(key, _Named(one.name, policy, one.generation, one.stored_fitness))
-    return list(found.values())
+        different.setdefault(key, _Named(candidate.name, policy, candidate.generation, candidate.stored_fitness))
+    return list(different.values())
 
 
 def _engine(

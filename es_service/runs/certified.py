@@ -45,13 +45,13 @@ class Episodes:
 
     def values(self) -> dict[str, float | int | None]:
         """Means with their intervals, and successes, by column name; None for what the task does not have."""
-        found: dict[str, float | int | None] = {}
+        columns: dict[str, float | int | None] = {}
         for name, values_E in (("return", self.return_E), ("last_reward", self.last_reward_E)):
-            found |= _interval(name, values_E)
-        found |= _interval("goal_distance", None if np.isnan(self.goal_distance_E).all() else self.goal_distance_E)
+            columns |= _interval(name, values_E)
+        columns |= _interval("goal_distance", None if np.isnan(self.goal_distance_E).all() else self.goal_distance_E)
         successes = None if self.success_E is None else int(self.success_E.sum())
         low, high = (None, None) if successes is None else share_interval(successes, self.count)
-        return found | {"successes": successes, "success_low": low, "success_high": high}
+        return columns | {"successes": successes, "success_low": low, "success_high": high}
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,12 @@ def target_reached(folder: Path, target: float | None) -> str:
     """Why a run is over whose `budget.target_certified` is this, in words; empty if no certified policy reaches it."""
     if target is None:
         return ""
-    for one in certified_policies(folder):
-        mean = one.row()[f"{one.selected_by}_mean"]
+    for policy in certified_policies(folder):
+        mean = policy.row()[f"{policy.selected_by}_mean"]
         if mean is not None and mean >= target:
             return (
-                f"the target {target:g} is reached: a policy of generation {one.generation} has {mean:.6g} in "
-                f"{one.episodes.count} certified episodes"
+                f"the target {target:g} is reached: a policy of generation {policy.generation} has {mean:.6g} in "
+                f"{policy.episodes.count} certified episodes"
             )
     return ""
 

@@ -55,7 +55,7 @@ def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[
     """What a config would change of the constants of a run, as `changed_constants` returns it."""
     fields = search_fields(type(config.search))
     defaults = {key: field.default for key, field in fields.items() if not field.is_required()}
-    options = {TASK_OPTIONS + name: one.default for name, one in task_of(config).options.items()}
+    options = {TASK_OPTIONS + name: option.default for name, option in task_of(config).options.items()}
     return changed_constants(constants, config.constants(), defaults | options)
 
 

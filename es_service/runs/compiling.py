@@ -57,7 +57,7 @@ def note_compiled(spec: WorkerSpec, kind: str) -> None:
     with contextlib.suppress(OSError):  # nothing but a sentence depends on it
         file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         file.touch()
-        for old in sorted(file.parent.iterdir(), key=lambda one: one.stat().st_mtime)[:-MOST_FILES]:
+        for old in sorted(file.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-MOST_FILES]:
             old.unlink(missing_ok=True)
 
 

@@ -125,16 +125,16 @@ def candidates(
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
-    found = []
+    chosen = []
     if best:
         snapshot = run.at(generation, lambda part: part == BEST)
-        found.append(Candidate("best", snapshot.policy("best"), snapshot.best.generation, snapshot.best.fitness))
+        chosen.append(Candidate("best", snapshot.policy("best"), snapshot.best.generation, snapshot.best.fitness))
     if centre:
         snapshot = run.at(generation, is_no_elite)
         _, fitness = snapshot.require_newest_centre()
-        found.append(Candidate("centre", snapshot.policy("centre"), snapshot.generation, fitness))
+        chosen.append(Candidate("centre", snapshot.policy("centre"), snapshot.generation, fitness))
     if not cells and not every and not top:
-        return found
+        return chosen
     wanted = None
     if not every:
         snapshot = run.at(generation, is_light)
@@ -149,8 +149,8 @@ def candidates(
         assert row is not None
         policy = make_policy(run.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
         name = ",".join(map(str, map_.geometry.index_of(cell)))
-        found.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
-    return found
+        chosen.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
+    return chosen
 
 
 def evaluation_config(run: Run, workers: int | None = None) -> RunConfig:
@@ -235,7 +235,7 @@ def workers_of(
 def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[_Totals]:
     """Moments of the fitness and of the descriptors of each centre, and its number of successes, a limited number of
     episodes at a time."""
-    found: list[_Totals] = []
+    totals: list[_Totals] = []
     for start in range(0, episodes, EPISODES_AT_ONCE):
         count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
         results = evaluate_centres(engine, centres, count, resets="same", first=first)
@@ -243,8 +243,8 @@ def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list
             (moments_of(result.fitness), moments_of(result.descriptor), int(np.sum(result.outputs.get("success", 0))))
             for result in results
         ]
-        found = list(map(_added, found, parts)) if found else parts
-    return found
+        totals = list(map(_added, totals, parts)) if totals else parts
+    return totals
 
 
 def _added(total: _Totals, part: _Totals) -> _Totals:

@@ -39,7 +39,7 @@ LARGEST = 2**63 - 1
 class Transitions:
     """The valid steps of all episodes: those of policy 0 in episode 0, of policy 0 in episode 1, and so on.
 
-    The observation after a step is the one of the next row, and that after an episode's last step is in
+    The observation after a step is that of the next row, and that after an episode's last step is in
     `last_observation`.
     """
 
@@ -257,7 +257,7 @@ def statistics_of(
     size = task.observation_size
     if mean is None and std is None:
         return no_statistics(policies, size)
-    found = []
+    statistics = []
     for name, given in (("observation_mean", mean), ("observation_std", std)):
         allowed = f"an array of shape ({size},) or ({policies}, {size}), or None for both statistics"
         if given is None:
@@ -267,10 +267,10 @@ def statistics_of(
             raise _wrong(name, f"has the shape {array.shape}", array.shape, allowed)
         if not np.isfinite(array).all():
             raise _wrong(name, "has NaN or infinite float32 numbers", None, "finite numbers")
-        found.append(np.ascontiguousarray(np.broadcast_to(array, (policies, size))))
-    if not (found[1] > 0.0).all():
+        statistics.append(np.ascontiguousarray(np.broadcast_to(array, (policies, size))))
+    if not (statistics[1] > 0.0).all():
         raise _wrong("observation_std", "has numbers that are not positive", None, "positive numbers")
-    return found[0], found[1]
+    return statistics[0], statistics[1]
 
 
 @contextmanager

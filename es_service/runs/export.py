@@ -90,7 +90,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     """
     snapshot = run.at()
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
-    found: dict[str, Any] = {
+    exported: dict[str, Any] = {
         "widths": np.array(spec.widths),
         "activation": np.array(spec.activation),
         "output": np.array(spec.output),
@@ -101,19 +101,19 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     stored: list[Literal["best", "centre"]] = ["best"] if snapshot.newest_centre is None else ["best", "centre"]
     for which in stored:
         policy = snapshot.policy(which)
-        found |= {
+        exported |= {
             f"{which}_parameters": policy.parameters_D,
             f"{which}_mean": policy.observation_mean_O,
             f"{which}_std": policy.observation_std_O,
         }
     if run.constants["map.enabled"]:
         map_, elites = snapshot.elites()
-        found |= _map_arrays(run, map_, elites)
+        exported |= _map_arrays(run, map_, elites)
     if (named := run.parameter_spec) is not None:
-        found["parameter_names"] = np.array(named.names)
-        of = [one.removesuffix("parameters") for one in found if one.endswith("parameters")]
-        found |= {f"{one}values": named.values(found[f"{one}parameters"]) for one in of}
-    return found
+        exported["parameter_names"] = np.array(named.names)
+        of = [name.removesuffix("parameters") for name in exported if name.endswith("parameters")]
+        exported |= {f"{prefix}values": named.values(exported[f"{prefix}parameters"]) for prefix in of}
+    return exported
 
 
 def ribs_archive(run: Run) -> Any:
@@ -230,15 +230,15 @@ def _parquet(run: Run, folder: Path) -> list[Path]:
 
 def _write_sums(folder: Path, files: list[Path]) -> Path:
     """Write the SHA-256 of new files into SHA256SUMS, beside those of other files that are still there."""
-    sums, found = folder / SUMS, {}
+    sums, digests = folder / SUMS, {}
     if sums.exists():
         lines = (line.partition("  ") for line in sums.read_text(encoding="utf-8", errors="replace").splitlines())
         there = {path.name for path in folder.iterdir()}
-        found = {name: sha256 for sha256, _, name in lines if name in there}
+        digests = {name: sha256 for sha256, _, name in lines if name in there}
     for file in files:
         with file.open("rb") as stream:
-            found[file.name] = hashlib.file_digest(stream, "sha256").hexdigest()
-    sums.write_text("".join(f"{sha256}  {name}\n" for name, sha256 in sorted(found.items())), encoding="utf-8")
+            digests[file.name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    sums.write_text("".join(f"{sha256}  {name}\n" for name, sha256 in sorted(digests.items())), encoding="utf-8")
     return sums
 
 

@@ -88,12 +88,12 @@ def _package(command: Sequence[str], out: str, text: str, configs: Sequence[RunC
     expected: set[str] = set()
     named = {path for config in configs for path in (config.task.environment, config.search.algorithm)}
     for path in filter(None, map(user_path, named)):
-        found = modules_of(path)
-        if found.is_installed:
+        modules = modules_of(path)
+        if modules.is_installed:
             expected.add(path.partition(":")[0].partition(".")[0])
         else:
-            files |= {one.source: one.file for one in found.user.values()}
-            expected |= found.others
+            files |= {module.source: module.file for module in modules.user.values()}
+            expected |= modules.others
     return JobPackage(
         (*command, "--out", out), out, text, dict(sorted(files.items())), tuple(sorted(expected - set(PACKAGES)))
     )

@@ -63,10 +63,10 @@ def submit(package: JobPackage, address: str) -> str:
 def list_jobs(address: str) -> list[Job]:
     """The es-service jobs on a cluster, newest first. Raises EvaluationError as `submit`."""
     with _explained(address):
-        found = _client(address).list_jobs()
+        all_jobs = _client(address).list_jobs()
     ours = [
         Job(job.submission_id, str(job.status.value), job.metadata[FOLDER], job.start_time or 0)
-        for job in found
+        for job in all_jobs
         if job.submission_id and FOLDER in (job.metadata or {})
     ]
     return sorted(ours, key=lambda job: job.started_ms, reverse=True)

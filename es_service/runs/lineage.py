@@ -145,7 +145,7 @@ def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
 
 
 def _evaluations(origin: Run, newest: int) -> Iterator[reader.EvaluatedCentres]:
-    """The evaluated centres of each generation up to one, read like the history."""
+    """Centres evaluated up to generation `newest`, read like the history."""
     for first in range(0, newest + 1, ROWS_AT_ONCE):
         yield from reader.read_evaluations(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
@@ -190,7 +190,7 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
     folder, which = start_of(init_from)
     origin, spec = open_run(folder), policy_spec(config, task_of(config))
     if origin.policy_spec != spec:
-        mine, theirs = ({**vars(one), "widths": list(one.widths)} for one in (spec, origin.policy_spec))
+        mine, theirs = ({**vars(network), "widths": list(network.widths)} for network in (spec, origin.policy_spec))
         name = next(name for name in mine if mine[name] != theirs[name])
         word, key = ("layers", "hidden") if name == "widths" else (name, name)
         raise ConfigError(
@@ -244,14 +244,14 @@ def _several(
             elite = elites[int(map_.cell_N[row])]
             policies.append(make_policy(origin.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O))
     different: dict[bytes, Policy] = {}
-    for one in policies:  # the best centre is often an elite
-        different.setdefault(one.parameters_D.tobytes() + one.observation_mean_O.tobytes(), one)
+    for policy in policies:  # the best centre is often an elite
+        different.setdefault(policy.parameters_D.tobytes() + policy.observation_mean_O.tobytes(), policy)
     chosen = list(different.values())[: search.screened]
     _tell_otherwise(origin, config, tell)
     start = {
-        SEVERAL: np.stack([one.parameters_D for one in chosen]),
-        "mean_K_O": np.stack([one.observation_mean_O for one in chosen]),
-        "std_K_O": np.stack([one.observation_std_O for one in chosen]),
+        SEVERAL: np.stack([policy.parameters_D for policy in chosen]),
+        "mean_K_O": np.stack([policy.observation_mean_O for policy in chosen]),
+        "std_K_O": np.stack([policy.observation_std_O for policy in chosen]),
         **moments_to_arrays(no_observations(origin.policy_spec.widths[0])),
     }
     return _lineage(origin, snapshot.generation), Beginning(start=start)

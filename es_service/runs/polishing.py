@@ -17,7 +17,7 @@ from es_service.runs.checked_config import load_config
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 
-METHOD = next(name for name, one in ALGORITHMS.items() if issubclass(one.settings, CandidatesConfig))
+METHOD = next(name for name, method in ALGORITHMS.items() if issubclass(method.settings, CandidatesConfig))
 """The method that starts from several policies of another run."""
 
 
@@ -63,8 +63,8 @@ def certify_both(
 def _certified(
     run: Run, by: Measure | None, centre: bool, workers: int | None, on_notice: Callable[[str], None]
 ) -> list[Certified]:
-    found = [one for one in certified_policies(run.folder) if by in (None, one.selected_by)]
-    if found:
-        newest = max(one.number for one in found)
-        return [one for one in found if one.number == newest]
+    certified = [policy for policy in certified_policies(run.folder) if by in (None, policy.selected_by)]
+    if certified:
+        newest = max(policy.number for policy in certified)
+        return [policy for policy in certified if policy.number == newest]
     return certify_run(run.folder, centre=centre, by=by, workers=workers, on_notice=on_notice)

@@ -15,7 +15,7 @@ from es_service.runs.view import Run
 from es_service.store.reader import read_evaluations
 
 CENTRES = 1000
-"""About so many centres, of whole generations, are the recent ones."""
+"""About so many centres, of whole generations, are recent."""
 FAULTS_OF = 1000
 """Newest generations whose faults are counted; a report shows those of all."""
 
@@ -52,7 +52,7 @@ def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives]:
     count = min(generation + 1, max(1, CENTRES // max(1, len(newest))))
     recent = read_evaluations(run.folder, generation + 1 - count, count)
     of_generation, of_all = (
-        np.array([one["fitness_weight"] for one in centres if np.isfinite(one["update_norm"])])
-        for centres in (newest, [one for each in recent for one in each])
+        np.array([centre["fitness_weight"] for centre in centres if np.isfinite(centre["update_norm"])])
+        for centres in (newest, [centre for each in recent for centre in each])
     )
     return objectives(of_generation), objectives(of_all)

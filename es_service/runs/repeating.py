@@ -41,14 +41,14 @@ def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str
 
 
 def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """(where a task was tried again, where it has not repeated itself) by what `examined` has found twice."""
+    """(where a task was tried again, where it has not repeated itself) by two results of `examined`."""
     same = {**first["hashes"], "in another process": second["hashes"][ALONE]}
-    tried = [one for one in same if one != ALONE]
-    return tried, [one for one in tried if same[one] != same[ALONE]]
+    tried = [where for where in same if where != ALONE]
+    return tried, [where for where in tried if same[where] != same[ALONE]]
 
 
 def why_not_repeatable(run: Run, config: RunConfig) -> str:
-    """Where the task of a run does not repeat itself, in words: as the run has recorded, or else as is found now.
+    """Where the task of a run does not repeat itself, in words: as the run has recorded, or else as examined now.
 
     Empty if it repeats itself, as far as can be found, and for tasks in JAX.
     """
@@ -58,7 +58,7 @@ def why_not_repeatable(run: Run, config: RunConfig) -> str:
     if task.kind not in ("python", "function"):
         return ""
     settings = settings_of_description(config.task.environment, config.task.options, config.task.descriptor)
-    found = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
-    if any("problem" in one for one in found):
+    answers = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
+    if any("problem" in answer for answer in answers):
         return ""
-    return " and ".join(compared(*found)[1])
+    return " and ".join(compared(*answers)[1])

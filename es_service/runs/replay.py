@@ -95,16 +95,16 @@ def record(
     config = changed_config(run.present_config, overrides)
     chosen = candidates(run, best=best, centre=False, cells=cells, every=False)
     now = {**platform_info(), CODE: code_of(config)}
-    stored = [_stored(run, one, now) for one in chosen]
+    stored = [_stored(run, candidate, now) for candidate in chosen]
     if certified:
         policy, episode = _certified(run, config, now)
         chosen, stored = [policy, *chosen], [episode, *stored]
     requests = [
-        RecordRequest(_centre(one), config.seed) if its is None else its.request
-        for one, its in zip(chosen, stored, strict=True)
+        RecordRequest(_centre(candidate), config.seed) if its is None else its.request
+        for candidate, its in zip(chosen, stored, strict=True)
     ]
-    found = _answer((worker_spec(config, task_of(config)), requests))
-    return [Replay(*one) for one in zip(chosen, found.recordings, stored, strict=True)], found
+    recorded = _answer((worker_spec(config, task_of(config)), requests))
+    return [Replay(*parts) for parts in zip(chosen, recorded.recordings, stored, strict=True)], recorded
 
 
 def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Candidate, StoredEpisode]:
@@ -112,46 +112,46 @@ def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Can
 
     Raises NotInRunError if there is none.
     """
-    policy, one = run.policy("certified"), newest_certified(run.folder)
-    assert one is not None
-    fitness_E = one.episodes.return_E if config.task.fitness == "sum" else one.episodes.last_reward_E
+    policy, certified = run.policy("certified"), newest_certified(run.folder)
+    assert certified is not None
+    fitness_E = certified.episodes.return_E if config.task.fitness == "sum" else certified.episodes.last_reward_E
     episode = int(np.argsort(fitness_E, kind="stable")[(fitness_E.size - 1) // 2])
-    candidate = Candidate(CERTIFIED, policy, one.number, float(fitness_E.mean()))
+    candidate = Candidate(CERTIFIED, policy, certified.number, float(fitness_E.mean()))
     request = RecordRequest(
         _centre(candidate), config.seed, policy=0, episode=episode, domain=Domain.CERTIFICATION_RESET
     )
-    changes = tuple(changes_since(one.platform, now))
-    return candidate, StoredEpisode(request, float(fitness_E[episode]), None, changes, one.number)
+    changes = tuple(changes_since(certified.platform, now))
+    return candidate, StoredEpisode(request, float(fitness_E[episode]), None, changes, certified.number)
 
 
-def _centre(one: Candidate) -> Centre:
-    policy = one.policy
-    return Centre(one.generation, policy.parameters_D, 0.0, policy.observation_mean_O, policy.observation_std_O)
+def _centre(candidate: Candidate) -> Centre:
+    policy = candidate.policy
+    return Centre(candidate.generation, policy.parameters_D, 0.0, policy.observation_mean_O, policy.observation_std_O)
 
 
-def _stored(run: Run, one: Candidate, now: Mapping[str, Any]) -> StoredEpisode | None:
+def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpisode | None:
     """What is stored of a policy's first evaluation episode; None if its address is not."""
-    if not np.isfinite(one.stored_fitness):
+    if not np.isfinite(candidate.stored_fitness):
         return None  # a fork that changed the meaning of fitness has kept the policy, but not its evaluation
-    if one.cell is None:
-        [history] = reader.read_history(run.folder, one.generation, 1)
+    if candidate.cell is None:
+        [history] = reader.read_history(run.folder, candidate.generation, 1)
         centre, trace_T_B = history["centre"], None  # the best was the fittest of its generation
     else:
-        map_, elites = run.elites([one.cell])
-        centre, trace_T_B = map_.centre_N[map_.row_of(one.cell)], elites[one.cell].trace_T_B
-    [rows] = reader.read_evaluations(run.folder, one.generation, 1)
+        map_, elites = run.elites([candidate.cell])
+        centre, trace_T_B = map_.centre_N[map_.row_of(candidate.cell)], elites[candidate.cell].trace_T_B
+    [rows] = reader.read_evaluations(run.folder, candidate.generation, 1)
     row = next((row for row in rows if row["centre"] == centre), {})
     seed, episode, ask, policy = (row.get(f"reset_{field.name}", np.nan) for field in fields(Resets))
     if np.isnan(seed):
         return None
     resets = Resets(int(seed), int(episode), int(ask), None if np.isnan(policy) else int(policy))
-    then = next((at for first, at in reversed(reader.read_platforms(run.folder)) if first <= one.generation), {})
+    then = next((at for first, at in reversed(reader.read_platforms(run.folder)) if first <= candidate.generation), {})
     changes = changes_since(then, now)
     parent, rollout = run.meta.parent, run.constants["compute.rollout"]
-    if parent is not None and one.generation <= parent["generation"] and reader.read_start(run.folder) is None:
+    if parent is not None and candidate.generation <= parent["generation"] and reader.read_start(run.folder) is None:
         rollouts = parent.get("rollouts", ["unknown"])  # this run is a fork, and its parent has computed the episode
         changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
-    request = RecordRequest(_centre(one), **vars(resets))
+    request = RecordRequest(_centre(candidate), **vars(resets))
     return StoredEpisode(request, row["fitness_first"], trace_T_B, tuple(changes))
 
 

@@ -66,8 +66,8 @@ REPLAYED, SCATTER = 64, 0.05
 UNBOUNDED = 1e3
 """In the place of a bound of the descriptor that is larger."""
 ECHO_ITEMS, ECHO_CHUNKS, SPIN_S = 100, 32, 0.003
-"""Work items in each measurement of messages, the chunks of one that has several, and the time that the actor computes
-for one: while it does so, the driver falls asleep, and being woken is a part of what a message costs."""
+"""Work items in each measurement of messages, chunks of an item that has several, and the time that the actor computes
+for it: while it does so, the driver falls asleep, and being woken is a part of what a message costs."""
 
 
 def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int) -> Iterator[dict[str, Any]]:
@@ -87,13 +87,13 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     steps = _steps(search, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
-        found = predict(phases, costs, count // cores, cores, partial(_longest_part, cores=cores))
+        prediction = predict(phases, costs, count // cores, cores, partial(_longest_part, cores=cores))
         yield {
             "workers": count,
-            "seconds_per_generation": round(found.seconds, 6),
-            "steps_per_second": round(steps / found.seconds),
-            "efficiency": round(found.efficiency, 3),
-            "limit": found.limit,
+            "seconds_per_generation": round(prediction.seconds, 6),
+            "steps_per_second": round(steps / prediction.seconds),
+            "efficiency": round(prediction.efficiency, 3),
+            "limit": prediction.limit,
         }
 
 
@@ -118,7 +118,11 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: Run
     if phase.kind == "PolicyChunk":
         search = _search(config)
         asked = search.algorithm.ask(initial_state(search).search, 1)
-        return [one for policies in policies_asked(config, search.task, 1, asked) for one in policies.work]
+        return [
+            subject_chunk
+            for policies in policies_asked(config, search.task, 1, asked)
+            for subject_chunk in policies.work
+        ]
     ids = range(phase.chunks // len(centres))
     weights_P = np.ones(spec.gradient_block_pairs, np.float32)
     if phase.name == "gradient":
@@ -263,7 +267,7 @@ class _Replay:
         }
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        return [_of_slots(next(self._answers[_kind(one)]), *one) for one in work]
+        return [_of_slots(next(self._answers[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work]
 
 
 def _of_slots(answer: ChunkResult, subject: Subject, chunk: Chunk) -> ChunkResult:

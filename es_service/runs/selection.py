@@ -35,20 +35,20 @@ class SelectionRecord:
     @property
     def count(self) -> int:
         """Number of its selection episodes."""
-        return sum(one.count for one in self.rounds)
+        return sum(episodes.count for episodes in self.rounds)
 
     def mean(self, by: Measure) -> float:
         """Mean of a measure over all its episodes, higher is better; NaN without episodes."""
         values = {
-            "return": lambda one: one.return_E,
-            "last_reward": lambda one: one.last_reward_E,
-            "success": lambda one: one.success_E,
-            "goal_distance": lambda one: -one.goal_distance_E,
+            "return": lambda episodes: episodes.return_E,
+            "last_reward": lambda episodes: episodes.last_reward_E,
+            "success": lambda episodes: episodes.success_E,
+            "goal_distance": lambda episodes: -episodes.goal_distance_E,
         }[by]
         if not self.rounds:
             return math.nan
         with np.errstate(invalid="ignore", over="ignore"):
-            return float(np.concatenate([values(one) for one in self.rounds]).mean(dtype=np.float64))
+            return float(np.concatenate([values(episodes) for episodes in self.rounds]).mean(dtype=np.float64))
 
     def order(self, by: Measure) -> tuple[float, float]:
         """Key by which the best is the first; a mean that is not finite comes last."""
@@ -73,11 +73,13 @@ def halved(
     """
     left, episodes, steps, ask = [SelectionRecord(index) for index in range(len(given))], FIRST_EPISODES, 0, 0
     while len(left) > 1:
-        policies = [given[one.index] for one in left]
+        policies = [given[record.index] for record in left]
         results = new_episodes(engine, policies, episodes, seed, number, ask, Domain.CANDIDATE_RESET)
         steps += sum(map(steps_of, results))
-        left = [replace(one, rounds=(*one.rounds, kept(result))) for one, result in zip(left, results, strict=True)]
-        ranked = sorted(left, key=lambda one: one.order(by))  # stable: equal ones stay in the order given
+        left = [
+            replace(record, rounds=(*record.rounds, kept(result))) for record, result in zip(left, results, strict=True)
+        ]
+        ranked = sorted(left, key=lambda record: record.order(by))  # stable: equal ones stay in the order given
         if len(left) <= keep:
             return ranked, steps
         left = ranked[: max(keep, -(-len(left) // 2))]
@@ -108,10 +110,10 @@ def new_episodes(
         )
         for parameters_D, mean_O, std_O in policies
     ]
-    work: list[Work] = [one for each in asked for one in each.work]
+    work: list[Work] = [subject_chunk for each in asked for subject_chunk in each.work]
     answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
-    found = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
-    return [one_of(result, 0) for result in found]
+    results = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
+    return [one_of(result, 0) for result in results]
 
 
 def kept(result: EpisodesResult) -> Episodes:

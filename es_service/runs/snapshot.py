@@ -72,8 +72,8 @@ class Policy:
 
         def step(observation: Any) -> FloatArray:
             nonlocal memory_H
-            found, memory_H = self.act(observation, memory_H)
-            return found
+            actions, memory_H = self.act(observation, memory_H)
+            return actions
 
         return step
 
@@ -184,10 +184,10 @@ class Snapshot:
         row = {"centre": history["centre"], "fitness_mean": history["centre_fitness_mean"]}
         if centre_part(int(row["centre"])) not in self.parts:  # the row of the history is about a policy
             [rows] = reader.read_evaluations(self.folder, self.generation, 1)
-            rows = [one for one in rows if centre_part(int(one["centre"])) in self.parts]
+            rows = [centre_row for centre_row in rows if centre_part(int(centre_row["centre"])) in self.parts]
             if not rows:
                 return None
-            row = max(rows, key=lambda one: np.nan_to_num(one["fitness_mean"], nan=-np.inf))
+            row = max(rows, key=lambda centre_row: np.nan_to_num(centre_row["fitness_mean"], nan=-np.inf))
         return centre_from_arrays(self.parts[centre_part(int(row["centre"]))]), float(row["fitness_mean"])
 
     def require_newest_centre(self) -> tuple[CentreState, float]:

@@ -222,7 +222,7 @@ def _ended(run: SweptRun, child: _Child) -> SweptRun:
 
 
 def _at_first(planned: PlannedRun) -> SweptRun:
-    """A run before the sweep has started it: finished, if a former one has spent its budget."""
+    """A run that the sweep has not started: finished, if its budget was spent before."""
     limits = limits_of(planned.config.budget)
     row = _newest(planned.folder)
     reason = _reason(limits, row)

@@ -74,21 +74,21 @@ def plan(
     if len(named) < len(combinations):
         what = "two combinations of these values give folders with the same name; use a sweep for each"
         raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
-    found: list[PlannedRun] = []
+    planned: list[PlannedRun] = []
     wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
     for name, settings in named.items():
         wanted, folder = {**common, **settings}, out / name
         try:
             new = here and not holds_run(folder)
-            found.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new)))
+            planned.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new)))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
     if wrong:
         raise _refused(source, list(wrong.values()))
-    for run in found if here else ():
+    for run in planned if here else ():
         _require_same_constants(run)
-    return found
+    return planned
 
 
 def _refused(source: Source, problems: Sequence[Problem]) -> ConfigError:

@@ -39,7 +39,7 @@ def until_due(
     target = config.budget.target_certified
     if target is None:
         return on_generation
-    tested = [one.stored_fitness for one in certified_policies(folder) if one.name == BEST]
+    tested = [policy.stored_fitness for policy in certified_policies(folder) if policy.name == BEST]
     most = max((fitness for fitness in tested if fitness is not None), default=-math.inf)
 
     def answer(row: Mapping[str, Any]) -> object:

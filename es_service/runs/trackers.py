@@ -55,8 +55,8 @@ def check_trackers(names: Sequence[str]) -> None:
     for name in names:
         if name not in PACKAGES:
             raise unknown_name("tracker", name, PACKAGES, "log")
-        found = importlib.util.find_spec(PACKAGES[name])
-        if found is None or found.origin is None:  # a folder of the same name, as wandb makes it, is no package
+        spec = importlib.util.find_spec(PACKAGES[name])
+        if spec is None or spec.origin is None:  # a folder of the same name, as wandb makes it, is no package
             ways_out = [WayOut("install", "install it", extra=name)]
             sentence = f"the tracker {name} needs the package {PACKAGES[name]}"
             raise ConfigError(sentence, field="log", value=name, ways_out=ways_out)
@@ -102,9 +102,9 @@ class TensorBoard:
         return sorted(self._folder.glob(f"events.out.tfevents.*.{self._run.run_id}.*"))
 
     def newest(self) -> int:
-        event = importlib.import_module("tensorboardX.proto.event_pb2").Event
-        found = (event.FromString(record) for file in self.files() for record in _records(file.read_bytes()))
-        return max((one.step for one in found if one.HasField("summary")), default=-1)
+        event_type = importlib.import_module("tensorboardX.proto.event_pb2").Event
+        events = (event_type.FromString(record) for file in self.files() for record in _records(file.read_bytes()))
+        return max((event.step for event in events if event.HasField("summary")), default=-1)
 
     def log(self, rows: Sequence[Row]) -> None:
         made_by = importlib.import_module("tensorboardX.event_file_writer")
@@ -188,9 +188,9 @@ class MLflow:
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT)
         experiment = self._client.get_experiment_by_name(name)
         at = experiment.experiment_id if experiment is not None else self._client.create_experiment(name)
-        found = self._client.search_runs([at], f"tags.`{RUN_TAG}` = '{run.run_id}'")
-        if found:
-            self._id = found[0].info.run_id
+        runs = self._client.search_runs([at], f"tags.`{RUN_TAG}` = '{run.run_id}'")
+        if runs:
+            self._id = runs[0].info.run_id
             self._client.update_run(self._id, status="RUNNING")
             return
         entry = self._client.create_run(at, run_name=run.folder.absolute().name, tags={RUN_TAG: run.run_id})
@@ -199,7 +199,7 @@ class MLflow:
         self._client.log_batch(self._id, params=settings)
 
     def newest(self) -> int:
-        return max((one.step for one in self._client.get_metric_history(self._id, "env_steps")), default=-1)
+        return max((metric.step for metric in self._client.get_metric_history(self._id, "env_steps")), default=-1)
 
     def log(self, rows: Sequence[Row]) -> None:
         batch: list[Any] = []

@@ -55,19 +55,19 @@ def tracked(
     threads = {name: thread(name) for name in names}
 
     def begin(_: Row | None = None) -> None:
-        for one in threads.values():
-            if one.ident is None:
-                one.start()
+        for tracker_thread in threads.values():
+            if tracker_thread.ident is None:
+                tracker_thread.start()
 
     try:
         yield begin
         begin()  # a session without a generation: a tracker may lack rows of earlier ones
     finally:
         ended.set()
-        for name, one in threads.items():
-            if one.ident is not None:  # else no generation was run, and the folder may hold another run
-                one.join(FINISH_S)
-            if one.is_alive():
+        for name, tracker_thread in threads.items():
+            if tracker_thread.ident is not None:  # else no generation was run, and the folder may hold another run
+                tracker_thread.join(FINISH_S)
+            if tracker_thread.is_alive():
                 on_notice(f"the tracker {name} did not finish within {FINISH_S:g} s; {_LATER}")
 
 

@@ -165,13 +165,13 @@ class _Comparison:
         self._changed |= parts
         self.reached = generation
         stored = reader.read_row(self._run.folder, generation)
-        found = _history_differences(self._run, stored, history)
+        differences = _history_differences(self._run, stored, history)
         if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:
-            found.append("the evaluated centres")
+            differences.append("the evaluated centres")
         if state_sha256(self._sum) != stored.state:
-            found += _state_differences(self._stored, generation in self._whole, generation, new) or ["the state"]
-        self.differences = tuple(found)
-        if found or generation == self._last:
+            differences += _state_differences(self._stored, generation in self._whole, generation, new) or ["the state"]
+        self.differences = tuple(differences)
+        if differences or generation == self._last:
             raise _End
 
 

@@ -175,7 +175,7 @@ class Run:
         """
         import pandas as pd
 
-        return pd.DataFrame([one.row() for one in certified_policies(self.folder)])
+        return pd.DataFrame([policy.row() for policy in certified_policies(self.folder)])
 
     @property
     def descriptor_names(self) -> list[str]:
@@ -222,11 +222,11 @@ class Run:
         if which == "centre":
             return self.at(wanted=is_no_elite).policy("centre")
         if which == "certified":
-            found = newest_certified(self.folder)
-            if found is None:
+            policy = newest_certified(self.folder)
+            if policy is None:
                 way_out = WayOut("certify", "certify one", str(self.folder))
                 raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])
-            return make_policy(self.meta, found.parameters_D, found.observation_mean_O, found.observation_std_O)
+            return make_policy(self.meta, policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
         if isinstance(which, str):
             raise ValueError(f"policy({which!r}): choose 'best', 'centre', 'certified', or a cell such as (3, 17)")
         elite = self.elite(which)
@@ -266,13 +266,13 @@ def _frame(columns: Columns) -> pd.DataFrame:
     Int64."""
     import pandas as pd  # takes 0.25 s, which starting a run need not spend
 
-    found: dict[str, Any] = {
+    arrays: dict[str, Any] = {
         name: pd.arrays.IntegerArray(np.asarray(values), np.ma.getmaskarray(values))
         if np.ma.is_masked(values)
         else np.asarray(values)
         for name, values in columns.items()
     }
-    return pd.DataFrame(found, copy=False)
+    return pd.DataFrame(arrays, copy=False)
 
 
 def is_light(part: str) -> bool:

@@ -52,7 +52,7 @@ class _Room:
     @property
     def is_writeable(self) -> bool:
         """Whether there can be more; a search may have made a view of these arrays read-only, and them with it."""
-        return all(one.flags.writeable for one in (self.descriptor_B, self.generation, self.centre))
+        return all(array.flags.writeable for array in (self.descriptor_B, self.generation, self.centre))
 
 
 @dataclass(frozen=True)
@@ -258,12 +258,12 @@ def _mean_nearest(
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
     mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
     for index in np.flatnonzero(~sure_Q):  # such as many entries at equal distance, where episodes end at a border
-        one = slice(index, index + 1)
+        single = slice(index, index + 1)
         radius = reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)
         within = tree.entries_of(tree.kd.query_ball_point(query_Q_B[index], radius))
-        near_1_K = _squared_to(query_Q_B[one], archive.descriptor_N_B[None, within])
+        near_1_K = _squared_to(query_Q_B[single], archive.descriptor_N_B[None, within])
         near_1_K[:, within == excluded_Q[index]] = np.inf
-        mean_Q[one] = _mean_smallest(np.concatenate([near_1_K, tail_Q_N[one]], axis=1), neighbours, distance)
+        mean_Q[single] = _mean_smallest(np.concatenate([near_1_K, tail_Q_N[single]], axis=1), neighbours, distance)
     return mean_Q
 
 

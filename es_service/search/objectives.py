@@ -89,8 +89,8 @@ def values(objective: Objective, results: EpisodesResult) -> NDArray:
         "final": lambda: results.outputs["last_reward"],
         "goal_distance": lambda: -results.goal_distance[..., 0],
     }
-    found = of.get(objective.kind, lambda: results.fitness)()
-    return np.where(np.isnan(results.fitness), np.nan, found)
+    value = of.get(objective.kind, lambda: results.fitness)()
+    return np.where(np.isnan(results.fitness), np.nan, value)
 
 
 def target_values(target: TargetObjective, fitness: ArrayLike, descriptor_B: ArrayLike) -> NDArray[np.float64]:
@@ -134,7 +134,7 @@ def nearness_values(near: NearnessObjective, fitness: ArrayLike, descriptor_B: A
     fitness = np.asarray(fitness, np.float64)
     distance = np.linalg.norm(np.asarray(descriptor_B, np.float64) - np.asarray(near.descriptor), axis=-1)
     is_valid = np.isfinite(fitness) & np.isfinite(distance)
-    scaled = [_scaled(np.where(is_valid, one, np.nan)) for one in (-distance, fitness)]
+    scaled = [_scaled(np.where(is_valid, term, np.nan)) for term in (-distance, fitness)]
     return near.weight * scaled[0] + (1.0 - near.weight) * scaled[1]
 
 

@@ -74,7 +74,7 @@ def read_only(extra: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(extra, ReadOnly):
         return extra
     # A resumed run has arrays in C order; in another one, sums of the same values may have other bits.
-    ordered = {name: np.array(one, order="C") if _is_disordered(one) else one for name, one in extra.items()}
+    ordered = {name: np.array(value, order="C") if _is_disordered(value) else value for name, value in extra.items()}
     freeze(ordered.values())
     return ReadOnly(ordered)
 
@@ -107,7 +107,9 @@ class ByCell:
 
     def __post_init__(self) -> None:
         if not isinstance(self.entries, ReadOnly):
-            known = ((int(cell) if isinstance(cell, np.integer) else cell, one) for cell, one in self.entries.items())
+            known = (
+                (int(cell) if isinstance(cell, np.integer) else cell, content) for cell, content in self.entries.items()
+            )
             frozen = {cell: read_only(arrays) for cell, arrays in sorted(known, key=lambda entry: entry[0])}
             object.__setattr__(self, "entries", ReadOnly(frozen))
 
@@ -137,10 +139,10 @@ def problem(extra: Mapping[str, Any], before: Mapping[str, Any] = MappingProxyTy
         if not all(isinstance(cell, int) and cell >= 0 for cell in new):
             return f"{what} has cells that are no whole numbers from 0 on"
         every = new.values() if isinstance(value, ByCell) else [value.arrays]
-        wrong = [one for arrays in every for one in arrays.values() if not _is_array(one)]
+        wrong = [array for arrays in every for array in arrays.values() if not _is_array(array)]
         if wrong:
             return f"{what} has {_kind(wrong[0])} where a NumPy array of bools or numbers must be"
-        counts = {one.shape[:1] for one in value.arrays.values()} if isinstance(value, Appended) else {(0,)}
+        counts = {array.shape[:1] for array in value.arrays.values()} if isinstance(value, Appended) else {(0,)}
         if len(counts) != 1 or () in counts:
             return f"{what} must have one or more arrays, all with the same number of rows"
     return ""
@@ -151,7 +153,7 @@ def changes(extra: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Ar
 
     With an empty `before`, all pieces.
     """
-    found: dict[str, Arrays | None] = {}
+    differing: dict[str, Arrays | None] = {}
     now_by_name, then_by_name = ({}, {}) if extra is before else (_stored(extra), _stored(before))
     for name in [*now_by_name, *(then_by_name.keys() - now_by_name.keys())]:
         now, then = now_by_name.get(name), then_by_name.get(name)
@@ -162,28 +164,28 @@ def changes(extra: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Ar
         for number in [*pieces, *(earlier.keys() - pieces.keys())]:
             arrays, arrays_then = pieces.get(number), earlier.get(number)
             if arrays is None or arrays_then is None or not same_arrays(arrays, arrays_then):
-                found[name if number is None else f"{name}{PIECE}{number:08d}"] = arrays
-    return found
+                differing[name if number is None else f"{name}{PIECE}{number:08d}"] = arrays
+    return differing
 
 
 def from_parts(parts: Mapping[str, Arrays]) -> Mapping[str, Any]:
     """The values whose pieces are among the parts of a state; inverse of `changes(own, {})`."""
-    found: dict[str, Any] = dict(parts.get(OWN, {}))
+    values: dict[str, Any] = dict(parts.get(OWN, {}))
     numbered: dict[str, dict[int, Arrays]] = {}
     for name, arrays in parts.items():
         whole, is_piece, number = name.partition(PIECE)
         if name.startswith(WHOLE_PREFIX):
-            found[name.removeprefix(WHOLE_PREFIX)] = Whole(arrays)
+            values[name.removeprefix(WHOLE_PREFIX)] = Whole(arrays)
         elif whole.startswith((APPENDED_PREFIX, BY_CELL_PREFIX)):
             numbered.setdefault(whole, {}).update({int(number): arrays} if is_piece else {})
     for whole, entries in numbered.items():
         if whole.startswith(BY_CELL_PREFIX):
-            found[whole.removeprefix(BY_CELL_PREFIX)] = ByCell(entries)
+            values[whole.removeprefix(BY_CELL_PREFIX)] = ByCell(entries)
         else:
             blocks = [entries[number] for number in sorted(entries)]
             joined = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-            found[whole.removeprefix(APPENDED_PREFIX)] = Appended(joined)
-    return read_only(found)
+            values[whole.removeprefix(APPENDED_PREFIX)] = Appended(joined)
+    return read_only(values)
 
 
 def same_arrays(now: Arrays, then: Arrays) -> bool:
@@ -235,22 +237,23 @@ def _pieces(value: Named | None, first: int) -> Mapping[int | None, Arrays]:
         return {None: {}, **value.entries}
     if value is None:
         return {}
-    row_bytes = sum(one.dtype.itemsize * math.prod(one.shape[1:]) for one in value.arrays.values())
+    row_bytes = sum(array.dtype.itemsize * math.prod(array.shape[1:]) for array in value.arrays.values())
     rows = max(1, min(BLOCK_ROWS, BLOCK_BYTES // max(1, row_bytes)))
     count = len(next(iter(value.arrays.values())))
     blocks = range(first // rows, max(1, -(-count // rows)))
     return {
-        block: {name: one[block * rows : (block + 1) * rows] for name, one in value.arrays.items()} for block in blocks
+        block: {name: array[block * rows : (block + 1) * rows] for name, array in value.arrays.items()}
+        for block in blocks
     }
 
 
 def _same_first(now: Arrays, then: Arrays) -> int:
     """Number of first rows in which arrays are the same; 0 if they have other names, types or shapes of rows."""
-    if {name: (one.dtype, one.shape[1:]) for name, one in now.items()} != {
-        name: (one.dtype, one.shape[1:]) for name, one in then.items()
+    if {name: (array.dtype, array.shape[1:]) for name, array in now.items()} != {
+        name: (array.dtype, array.shape[1:]) for name, array in then.items()
     }:
         return 0
-    count = min(len(next(iter(one.values()))) for one in (now, then))
+    count = min(len(next(iter(arrays.values()))) for arrays in (now, then))
     for name in now:
         count = same_rows(now[name][:count], then[name][:count])
     return count

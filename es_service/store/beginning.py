@@ -68,7 +68,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         evaluations = iter(beginning.evaluations)
         for generation, given in enumerate(beginning.history):
             values = {column.name: given.get(column.name) for column in meta.columns}
-            evaluated = [row_bytes(stored_values(meta.evaluation_columns, one)) for one in next(evaluations, ())]
+            evaluated = [row_bytes(stored_values(meta.evaluation_columns, row)) for row in next(evaluations, ())]
             # The state of the newest generation is stored, but not those of the generations before it.
             state = state_sha256(state_sum(in_force if generation == beginning.newest else {}))
             insert_history(connection, meta, generation, values, b"".join(evaluated), state)

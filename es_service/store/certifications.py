@@ -67,16 +67,16 @@ def rows(connection: sqlite3.Connection, *, newest: bool = False) -> list[tuple[
     Args:
         newest: only the rows of the newest certification of which there are any.
     """
-    found: list[tuple[Key, CertifiedRow | None]] = []
+    row_list: list[tuple[Key, CertifiedRow | None]] = []
     query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number"
     for number, rank, facts, payload, sha256 in connection.execute(f"{query} {'DESC' if newest else ''}, rank"):
-        if newest and found and found[0][0][0] != number:
+        if newest and row_list and row_list[0][0][0] != number:
             break
         if not isinstance(payload, bytes) or _sha256(number, rank, facts, payload) != sha256:
-            found.append(((number, rank), None))
+            row_list.append(((number, rank), None))
         elif facts != _REMOVED:
-            found.append(((number, rank), CertifiedRow(number, rank, json.loads(facts), decode_part(payload))))
-    return found
+            row_list.append(((number, rank), CertifiedRow(number, rank, json.loads(facts), decode_part(payload))))
+    return row_list
 
 
 def remove(connection: sqlite3.Connection, keys: Iterable[Key]) -> None:

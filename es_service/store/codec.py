@@ -97,7 +97,7 @@ def part_sha256(part: str, generation: int, payload: bytes) -> str:
 
 
 def listed(sha256: str, payload: bytes) -> str:
-    """What a list of rows says of one: its SHA-256, or GONE if it removes its part."""
+    """A row's entry in a list of rows: its SHA-256, or GONE if it removes its part."""
     return sha256 if payload != NO_PAYLOAD else GONE
 
 

@@ -91,11 +91,11 @@ def _state(connection: sqlite3.Connection, until: int | None) -> dict[str, str]:
     parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads}
     of_map = {part: parts.pop(part) for part in [*parts] if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))}
     pieces = {part: parts.pop(part) for part in [*parts] if PIECE in part}
-    found = {f"state/{part}": sha256 for part, sha256 in parts.items()}
+    digests = {f"state/{part}": sha256 for part, sha256 in parts.items()}
     for whole, its_pieces in groupby(pieces, lambda piece: piece.partition(PIECE)[0]):
         heads = {whole: parts[whole]} if whole in parts else {}
-        found[f"state/{whole}"] = _together(heads | {piece: pieces[piece] for piece in its_pieces})
-    return found | ({"map": _together(of_map)} if of_map else {})
+        digests[f"state/{whole}"] = _together(heads | {piece: pieces[piece] for piece in its_pieces})
+    return digests | ({"map": _together(of_map)} if of_map else {})
 
 
 def _together(parts: Mapping[str, str]) -> str:

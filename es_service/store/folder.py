@@ -95,8 +95,8 @@ def holds_run(folder: Path) -> bool:
 
 def runs_inside(folder: Path) -> set[Path]:
     """The run folders directly inside a folder, except hidden ones: these are runs whose creation was interrupted."""
-    found = {file.parent for name in (DATABASE, COPY) for file in folder.glob(f"*/{name}")}
-    return {run for run in found if not run.name.startswith(".")}
+    runs = {file.parent for name in (DATABASE, COPY) for file in folder.glob(f"*/{name}")}
+    return {run for run in runs if not run.name.startswith(".")}
 
 
 def require_run_folder(folder: Path) -> None:

@@ -53,7 +53,7 @@ class RunLock:
     def release(self) -> None:
         """Release the lock, so that another writer can take it. This may be called again."""
         if self._descriptor >= 0:
-            self._write(self._end)  # of a holder that noted no end: what the one before it has left
+            self._write(self._end)  # of a holder that noted no end: what the previous holder left
             self.abandon()
 
     def _write(self, content: Mapping[str, Any]) -> None:
@@ -149,22 +149,22 @@ def last_end(folder: Path) -> str:
     """How the last session of a run whose lock is free ended, in words; empty if the session has not said it, as before
     version 0.17, or if there was none."""
     try:
-        found = _content((folder / LOCK).read_bytes()[:_MOST])
+        content = _content((folder / LOCK).read_bytes()[:_MOST])
     except OSError:
         return ""
-    if "ended" in found:
-        return str(found.get("how", ""))
-    if "pid" not in found:
+    if "ended" in content:
+        return str(content.get("how", ""))
+    if "pid" not in content:
         return ""
-    return f"its driver on {found.get('host')}, pid {found['pid']}, was killed, or its host failed"
+    return f"its driver on {content.get('host')}, pid {content['pid']}, was killed, or its host failed"
 
 
 def _content(text: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _locked(folder: Path) -> RunLockedError:

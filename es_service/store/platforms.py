@@ -32,8 +32,8 @@ def record(connection: sqlite3.Connection, generation: int, platform: dict[str, 
 def newest_before(connection: sqlite3.Connection, generation: int) -> dict[str, Any] | None:
     """The platform of the generation before this one; None if none is recorded."""
     query = "SELECT platform FROM platform WHERE generation < ? ORDER BY generation DESC LIMIT 1"
-    found = connection.execute(query, (generation,)).fetchone()
-    return None if found is None else json.loads(found[0])
+    row = connection.execute(query, (generation,)).fetchone()
+    return None if row is None else json.loads(row[0])
 
 
 def store_list(connection: sqlite3.Connection) -> None:
@@ -48,14 +48,14 @@ def store_list(connection: sqlite3.Connection) -> None:
 def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
     """Recorded platforms as (first generation, platform), in order. Raises Damaged if a record does not match its
     SHA-256, or is missing."""
-    found: dict[int, dict[str, Any]] = {}
+    platforms: dict[int, dict[str, Any]] = {}
     for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
         if text_sha256(f"platform {at}", text) != sha256:
             raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-        found[at] = json.loads(text)
+        platforms[at] = json.loads(text)
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
     for at in [] if newest is None else json.loads(get_meta(connection, LIST) or "[]"):
         # The row of a generation that was lost, and is not computed again yet, was deleted with it.
-        if at <= newest and at not in found:
+        if at <= newest and at not in platforms:
             raise Damaged(f"the platform recorded at generation {at} is missing")
-    return [*found.items()]
+    return [*platforms.items()]

@@ -62,16 +62,16 @@ def read_history(
         limit: greatest number of rows; None for all rows.
     """
     with reading(folder) as (connection, meta):
-        found = _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
-        return [row_dict(meta.columns, one.row) for one in found]
+        rows = _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
+        return [row_dict(meta.columns, stored.row) for stored in rows]
 
 
 def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
     """The history from generation 0 on, as columns; `limit` as in `read_history`."""
     with reading(folder) as (connection, meta):
         table = GrowingTable(meta.columns)
-        for one in _sound_rows(connection, meta, 0, limit):
-            table.add(one.row)
+        for stored in _sound_rows(connection, meta, 0, limit):
+            table.add(stored.row)
         return table.columns()
 
 
@@ -79,8 +79,10 @@ def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None 
     """The centres that each generation evaluated, in the order of the asks; arguments as in `read_history`."""
     with reading(folder) as (connection, meta):
         columns = meta.evaluation_columns
-        found = (table_rows(columns, one.evaluations) for one in _sound_rows(connection, meta, since_generation, limit))
-        return [[row_dict(columns, row) for row in rows] for rows in found]
+        tables = (
+            table_rows(columns, stored.evaluations) for stored in _sound_rows(connection, meta, since_generation, limit)
+        )
+        return [[row_dict(columns, row) for row in rows] for rows in tables]
 
 
 def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
@@ -88,17 +90,17 @@ def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
     generations."""
     with reading(folder) as (connection, meta):
         table = GrowingTable((GENERATION, *meta.evaluation_columns))
-        for one in _sound_rows(connection, meta, 0, limit):
-            for row in table_rows(meta.evaluation_columns, one.evaluations):
-                table.add((one.generation, *row))
+        for stored in _sound_rows(connection, meta, 0, limit):
+            for row in table_rows(meta.evaluation_columns, stored.evaluations):
+                table.add((stored.generation, *row))
         return table.columns()
 
 
 def read_row(folder: Path, generation: int) -> HistoryRow:
     """All that is stored of one generation in the history."""
     with reading(folder) as (connection, meta):
-        for one in _sound_rows(connection, meta, generation, 1):
-            return one
+        for stored in _sound_rows(connection, meta, generation, 1):
+            return stored
         raise Damaged(f"the history row of generation {generation} is missing")
 
 
@@ -181,9 +183,9 @@ def next_certification(folder: Path) -> int:
 def read_certifications(folder: Path, *, newest: bool = False) -> list[CertifiedRow]:
     """All certified policies, in the order of certification and rank; with `newest` those of the last certification."""
     with reading(folder) as (connection, _):
-        found = []
+        rows = []
         for (number, rank), row in certifications.rows(connection, newest=newest):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} does not match its SHA-256")
-            found.append(row)
-        return found
+            rows.append(row)
+        return rows

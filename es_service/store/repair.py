@@ -82,9 +82,9 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
     verdict = verify(connection, file)
     if not verdict.problems:
         return verdict
-    found = verdict.damage
+    damage = verdict.damage
     if verdict.good is None or (copy is not None and _reach(copy) > verdict.good):
-        raise Damaged(found)
+        raise Damaged(damage)
     kept = ""
     if verdict.newest is not None and verdict.good < verdict.newest - 1:
         old = file.with_name(f"{file.name}.damaged")  # DAMAGED, except for a damaged copy that is being restored
@@ -99,11 +99,11 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
         certifications.remove(connection, verdict.bad_certifications)
     if verdict.good == verdict.newest:
         notices.append(
-            f"{file}: {found}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
+            f"{file}: {damage}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
         )
     else:
         notices.append(
-            f"{file}: the state or the history of the newest generation, {verdict.newest}, is damaged ({found}); "
+            f"{file}: the state or the history of the newest generation, {verdict.newest}, is damaged ({damage}); "
             f"the run fell back to generation {verdict.good}, the newest whose state is stored and intact{kept}"
         )
     again = verify(connection, file)

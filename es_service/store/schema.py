@@ -133,21 +133,21 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
     for key, value, sha256 in rows:
         if text_sha256(str(key), str(value)) != sha256:
             raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
-    found = {key: value for key, value, _ in rows}
-    version = int(found.get("schema_version", 0))
+    records = {key: value for key, value, _ in rows}
+    version = int(records.get("schema_version", 0))
     if version > SCHEMA_VERSION:
         raise StoreError(
             f"{file} has schema version {version}; this version of es-service supports versions up to "
             f"{SCHEMA_VERSION}. Upgrade es-service to read or continue the run."
         )
-    if version < 1 or "run" not in found:
+    if version < 1 or "run" not in records:
         raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")
     if version < SCHEMA_VERSION:
         raise StoreError(
             f"{file} was written by an older version of es-service; use version {READ_BY[version]} to read or continue "
             f"it (its schema version is {version}, and this version of es-service supports {SCHEMA_VERSION})"
         )
-    fields = json.loads(found["run"])
+    fields = json.loads(records["run"])
     columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
     return RunMeta(**fields | columns)
 

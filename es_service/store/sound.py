@@ -80,23 +80,23 @@ class Followed:
             if self._rows is None or not self._rows.are_of(connection, meta):
                 self._rows, self._known = _Rows(meta), {}
             rows = self._rows
-            found: list[tuple[int, dict[str, Any]]] = []
+            platforms: list[tuple[int, dict[str, Any]]] = []
             whole = rows.read(connection, problems, most)
             with _noted(problems, "the platforms cannot be read"):
-                found = sound_platforms(connection)
+                platforms = sound_platforms(connection)
             generation, parts = None, {}
             with _noted(problems, "the state cannot be read"):
                 generation, parts = self._state(connection, problems)
             # Nothing can be added to a table whose columns are in use.
             history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
             newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
-            return SoundRun(meta, history, newest, evaluations, found, generation, parts, tuple(problems)), whole
+            return SoundRun(meta, history, newest, evaluations, platforms, generation, parts, tuple(problems)), whole
 
     def _state(self, connection: sqlite3.Connection, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
         """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
         stored = kept_rows(connection)
-        found = (newest_state(connection), newest_generation(connection))
-        if (newest := max((at for at in found if at is not None), default=None)) is None:
+        generations = (newest_state(connection), newest_generation(connection))
+        if (newest := max((at for at in generations if at is not None), default=None)) is None:
             return None, {}
         whole = whole_states(connection, stored)
         generation = max(whole, default=newest)
@@ -190,7 +190,7 @@ class _Rows:
         return whole
 
     def are_of(self, connection: sqlite3.Connection, meta: RunMeta) -> bool:
-        """Whether the last row is still that of the run, which may have fallen back, or be another one."""
+        """Whether the last row is still that of the run, which may have fallen back, or be another run."""
         if meta != self._meta or self.last is None:
             return meta == self._meta
         with _noted([], ""):

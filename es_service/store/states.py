@@ -136,15 +136,15 @@ class KeptStates:
     def outdated(self, keep_every: int | None) -> list[tuple[str, int]]:
         """(part, generation) of the rows that the next commit deletes: the rows that remain make up the states of its
         generation, of the one before it, and of those to keep, such as multiples of `keep_every`."""
-        found = []
+        rows = []
         for part in self._doubled:
             at, until = sorted(self._rows[part])[-2:]
             is_multiple = keep_every is not None and (until - 1) // keep_every * keep_every >= at
             if not is_multiple and not any(at <= generation < until for generation in self._earlier):
-                found.append((part, at))
+                rows.append((part, at))
                 if self._rows[part][until] == GONE and len(self._rows[part]) == 2:
-                    found.append((part, until))
-        return found
+                    rows.append((part, until))
+        return rows
 
     def commit(self, new: ListedRows, outdated: Iterable[tuple[str, int]], total: int) -> None:
         """Follow a commit, with what `total_after` and `outdated` have returned for it."""

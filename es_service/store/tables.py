@@ -44,10 +44,10 @@ class GrowingTable:
 
     def columns(self, *, copy: bool = False) -> Columns:
         """The columns by name. Unless they are copies, nothing can be added to the table afterwards."""
-        found = {name: np.array(values, copy=copy) for name, values, _ in self._columns}
+        arrays = {name: np.array(values, copy=copy) for name, values, _ in self._columns}
         return {
             name: np.ma.MaskedArray(values, values == NO_INTEGER) if values.dtype.kind == "i" else values
-            for name, values in found.items()
+            for name, values in arrays.items()
         }
 
 

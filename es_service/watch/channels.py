@@ -79,7 +79,7 @@ class Channel:
                 changed = self._changed
                 if version != self._version:
                     version = self._version
-                    yield self._event(tuple(one for one, text in self._texts.items() if sent.get(one) != text))
+                    yield self._event(tuple(id_ for id_, text in self._texts.items() if sent.get(id_) != text))
                     sent = self._texts
                 try:
                     await asyncio.wait_for(changed.wait(), ALIVE_S)
@@ -92,7 +92,7 @@ class Channel:
     def _event(self, ids: tuple[str, ...]) -> bytes:
         """The event with some sections; most viewers need the same, so the last one is kept."""
         if self._message[0] != (self._version, ids):
-            sections = ", ".join(f"{json.dumps(one)}: {self._texts[one]}" for one in ids)
+            sections = ", ".join(f"{json.dumps(id_)}: {self._texts[id_]}" for id_ in ids)
             head = f'"title": {json.dumps(self._title)}, "order": {json.dumps(list(self._texts))}'
             text = f'data: {{{head}, "sections": {{{sections}}}}}\n\n'
             self._message = (self._version, ids), text.encode(errors="replace")
@@ -133,7 +133,7 @@ class Channel:
         picture = self._draw()
         if picture is None:
             return None
-        texts = {one: _text(html, picture.scripts.get(one)) for one, html in picture.sections.items() if html}
+        texts = {id_: _text(html, picture.scripts.get(id_)) for id_, html in picture.sections.items() if html}
         return picture.title, texts, picture.more
 
 

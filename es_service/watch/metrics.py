@@ -31,17 +31,17 @@ PREFIX = "es_service_"
 def metrics(summaries: Iterable[Summary]) -> str:
     """A gauge for each number of each run, labelled with the run, its task and its search."""
     values: dict[str, list[str]] = {name: [] for name in (*GAUGES, *OTHERS)}
-    for one in summaries:
-        labels = {"run": one.found.name}
+    for summary in summaries:
+        labels = {"run": summary.found.name}
         try:
-            found = _values(one)
-            if one.status is not None:
-                constants = one.status.run.constants
+            numbers = _values(summary)
+            if summary.status is not None:
+                constants = summary.status.run.constants
                 labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
         except FORGED:
-            found = {"readable": 0.0}
+            numbers = {"readable": 0.0}
         shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labels.items())
-        for name, value in found.items():
+        for name, value in numbers.items():
             if math.isfinite(value):
                 values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
     about = {name: text for name, (_, text) in GAUGES.items()} | OTHERS
@@ -52,23 +52,23 @@ def metrics(summaries: Iterable[Summary]) -> str:
     )
 
 
-def _values(one: Summary) -> Mapping[str, float]:
-    found: dict[str, float] = {"readable": float(one.status is not None)}
-    if one.status is None:
-        return found
-    row = one.status.row
-    found["running"] = float(one.status.driver is not None)
-    if one.certified is not None:
-        found["certified_fitness"] = float(one.certified.row()["return_mean"])
+def _values(summary: Summary) -> Mapping[str, float]:
+    numbers: dict[str, float] = {"readable": float(summary.status is not None)}
+    if summary.status is None:
+        return numbers
+    row = summary.status.row
+    numbers["running"] = float(summary.status.driver is not None)
+    if summary.certified is not None:
+        numbers["certified_fitness"] = float(summary.certified.row()["return_mean"])
     if row is not None:
-        found |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
+        numbers |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
         try:
-            recent = read_recent(one.status.run, int(row["generation"]))
+            recent = read_recent(summary.status.run, int(row["generation"]))
         except ServiceError:  # it was deleted meanwhile
-            return found
+            return numbers
         if recent.problem is None:
-            found |= {"lost_workers": float(recent.lost_workers), "retries": float(recent.retries)}
-    return found
+            numbers |= {"lost_workers": float(recent.lost_workers), "retries": float(recent.retries)}
+    return numbers
 
 
 def _escaped(text: str) -> str:

@@ -68,39 +68,39 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
     """What draws the list of all runs."""
 
     def draw() -> Picture:
-        found = runs.summaries()
-        running = sum(one.status is not None and one.status.driver is not None for one in found)
-        said = f"{len(found):,} runs, of which {running:,} are running." if found else "There is no run yet."
-        rows = [tag("tr", *_row(one)) for one in found]
+        summaries = runs.summaries()
+        running = sum(summary.status is not None and summary.status.driver is not None for summary in summaries)
+        said = f"{len(summaries):,} runs, of which {running:,} are running." if summaries else "There is no run yet."
+        rows = [tag("tr", *_row(summary)) for summary in summaries]
         heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
         listed = tag("div", tag("table", heads, tag("tbody", *rows), class_="runs"), class_="scroll") if rows else None
-        choice = tag("button", "Compare the ticked runs", type="submit") if len(found) > 1 else None
+        choice = tag("button", "Compare the ticked runs", type="submit") if len(summaries) > 1 else None
         form = tag("form", tag("p", said, class_="verdict"), listed, choice, action="/compare", method="get")
         return Picture("Runs", {"runs": tag("section", form, id="runs")}, {})
 
     return draw
 
 
-def _row(one: Summary) -> list[Markup]:
+def _row(summary: Summary) -> list[Markup]:
     """The cells of a row; a run with forged data hides no other."""
     try:
-        return _cells(one)
+        return _cells(summary)
     except FORGED as error:
-        return _cells(Summary(one.found, None, None, f"its data are not those of a run: {error!r}"))
+        return _cells(Summary(summary.found, None, None, f"its data are not those of a run: {error!r}"))
 
 
-def _cells(one: Summary) -> list[Markup]:
+def _cells(summary: Summary) -> list[Markup]:
     """The cells of a row, each with the name of its column for narrow windows."""
-    found, status = one.found, one.status
-    box = tag("input", type="checkbox", name="run", value=found.key, aria_label=f"compare {found.name}")
-    link = tag("a", found.name, href=f"/run/{found.key}")
+    run, status = summary.found, summary.status
+    box = tag("input", type="checkbox", name="run", value=run.key, aria_label=f"compare {run.name}")
+    link = tag("a", run.name, href=f"/run/{run.key}")
     if status is None:
-        values = [None, link, tag("span", one.problem, class_="problem"), *[None] * (len(HEADS) - 3)]
+        values = [None, link, tag("span", summary.problem, class_="problem"), *[None] * (len(HEADS) - 3)]
     else:
         constants, row, limits = status.run.constants, status.row or {}, status.limits
         of = {key: f" of {short(limit)}" for key, limit in limits.items()}
         best = number(row["best_fitness"]) if row else ""
-        certified = "" if one.certified is None else number(one.certified.row()["return_mean"])
+        certified = "" if summary.certified is None else number(summary.certified.row()["return_mean"])
         share = row.get("coverage")
         coverage = "" if share is None else f"{100 * share:.1f} %"
         values = [
@@ -130,7 +130,7 @@ def draw_run(runs: Runs, found: Found, reading: Reading) -> Callable[[], Picture
             other = None if reading.data is None else runs.moved(reading.data.meta.run_id, found)
             before, told = told, f"{error.sentence} {other}"
             where = () if other is None else (" It is now ", tag("a", other.name, href=f"/run/{other.key}"), ".")
-            others = {one: html for one, html in last.sections.items() if one != "live"}
+            others = {id_: html for id_, html in last.sections.items() if id_ != "live"}
             shown = {"live": _notice(error.sentence, *where), **others}
             return None if told == before else last._replace(sections=shown, more=False)
         assert reading.data is not None
@@ -146,7 +146,7 @@ def _run_picture(data: RunData, *, whole: bool) -> Picture:
         newest = data.last("generation")
         said = f"Generations up to {newest:,.0f} are shown, since the others are still being read."
         sections = {"live": _notice(said)} | sections
-    shown = {("replays" if one == REPLAY else one): html for one, html in sections.items()}
+    shown = {("replays" if id_ == REPLAY else id_): html for id_, html in sections.items()}
     if "replays" in shown:
         policies = {"best": "the best centre"} | ({CERTIFIED: "the certified policy"} if data.certified else {})
         buttons = [
@@ -156,7 +156,9 @@ def _run_picture(data: RunData, *, whole: bool) -> Picture:
         note = tag("p", NO_REPLAY, class_="note") if "map" in scripts else None
         controls = tag("div", *buttons, tag("span", id="recording", role="status"), class_="controls")
         shown["replays"] = section("Replay", note, controls, tag("div", id="shown"), id_="replays")
-    return Picture(run_title(data), shown, {SECTION_OF[name]: {name: one} for name, one in scripts.items()}, not whole)
+    return Picture(
+        run_title(data), shown, {SECTION_OF[name]: {name: script} for name, script in scripts.items()}, not whole
+    )
 
 
 def draw_comparison(readings: Sequence[tuple[Found, Reading]], keys: Sequence[str]) -> Callable[[], Picture | None]:
@@ -172,18 +174,22 @@ def draw_comparison(readings: Sequence[tuple[Found, Reading]], keys: Sequence[st
             except ServiceError as error:
                 notices.append(error.sentence)
         used = [reading for _, reading in readings if reading.data is not None and _begun(reading.data)]
-        notices += [f"{found.name} has no finished generation yet." for found, one in readings if one not in used]
+        notices += [
+            f"{run.name} has no finished generation yet." for run, each_reading in readings if each_reading not in used
+        ]
         if not any(changed) and notices == drawn:
             return None
         drawn = notices
         try:
-            title, sections, scripts = comparison_sections([one.data for one in used if one.data], keys)
+            title, sections, scripts = comparison_sections(
+                [each_reading.data for each_reading in used if each_reading.data], keys
+            )
         except ServiceError as error:
             title, sections, scripts = "Comparison", {}, {}
             notices = [*notices, error.sentence]
         shown = {"live": _notice(*notices)} if notices else {}
-        of = {SECTION_OF[name]: {name: one} for name, one in scripts.items()}
-        return Picture(title, shown | sections, of, not all(one.whole for one in used))
+        of = {SECTION_OF[name]: {name: script} for name, script in scripts.items()}
+        return Picture(title, shown | sections, of, not all(each_reading.whole for each_reading in used))
 
     return draw
 

@@ -66,31 +66,31 @@ class Runs:
 
     def find(self) -> list[Found]:
         """The runs that there are now, in the order of their names."""
-        found = {one.key: one for root in self._roots for one in _below(root)}
-        self._known |= found
-        self._summaries = {key: one for key, one in self._summaries.items() if key in found}
-        return list(found.values())
+        runs = {run.key: run for root in self._roots for run in _below(root)}
+        self._known |= runs
+        self._summaries = {key: seen_summary for key, seen_summary in self._summaries.items() if key in runs}
+        return list(runs.values())
 
     def get(self, key: str) -> Found | None:
         """A run that is there, or was there before; None if there is none of this key."""
-        return self._known.get(key) or {one.key: one for one in self.find()}.get(key)
+        return self._known.get(key) or {run.key: run for run in self.find()}.get(key)
 
     def summaries(self) -> list[Summary]:
         """All runs; those whose files have not changed are not read again."""
-        return [self._summary(one) for one in self.find()]
+        return [self._summary(run) for run in self.find()]
 
-    def _summary(self, found: Found) -> Summary:
-        seen = seen_of(found.folder)
-        before = self._summaries.get(found.key)
+    def _summary(self, run: Found) -> Summary:
+        seen = seen_of(run.folder)
+        before = self._summaries.get(run.key)
         if before is None or before[0] != seen:
-            self._summaries[found.key] = before = seen, _summary(found)
+            self._summaries[run.key] = before = seen, _summary(run)
         return before[1]
 
     def moved(self, run_id: str, but: Found) -> Found | None:
         """A run of this id in another folder."""
-        for one in self.summaries():
-            if one.found.key != but.key and one.status is not None and one.status.run.run_id == run_id:
-                return one.found
+        for summary in self.summaries():
+            if summary.found.key != but.key and summary.status is not None and summary.status.run.run_id == run_id:
+                return summary.found
         return None
 
 
@@ -113,21 +113,21 @@ class Reading:
         require_inside(self._found)
         driver = lock_holder(self._found.folder)  # read before the history, so that the last row is not missed
         self.whole, self._seen = False, None
-        found, self.whole = self._followed.read(MOST_ROWS)
-        self.data, self._seen = run_data(self._found.folder, found, driver), seen
+        sound, self.whole = self._followed.read(MOST_ROWS)
+        self.data, self._seen = run_data(self._found.folder, sound, driver), seen
         return True
 
 
 def seen_of(folder: Path) -> Mapping[str, Any]:
     """What shows without opening a run whether it has changed: its files, and who writes."""
-    found: dict[str, Any] = {}
+    files: dict[str, Any] = {}
     for name in (DATABASE, f"{DATABASE}-wal", COPY, CONFIG):
         try:
             stat = os.stat(folder / name)
         except OSError:
             continue
-        found[name] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
-    return found | {LOCK: lock_holder(folder)}
+        files[name] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+    return files | {LOCK: lock_holder(folder)}
 
 
 def require_inside(found: Found) -> None:
@@ -139,16 +139,16 @@ def require_inside(found: Found) -> None:
             raise StoreError(what, run=found.folder)
 
 
-def _summary(found: Found) -> Summary:
+def _summary(run: Found) -> Summary:
     try:
-        require_inside(found)
-        status = read_status(open_run(found.folder))
-        certified = newest_certified(found.folder)
+        require_inside(run)
+        status = read_status(open_run(run.folder))
+        certified = newest_certified(run.folder)
     except ServiceError as error:
-        return Summary(found, None, None, " ".join(error.sentence.split()))
+        return Summary(run, None, None, " ".join(error.sentence.split()))
     except FORGED as error:
-        return Summary(found, None, None, f"its data are not those of a run: {error!r}")
-    return Summary(found, status, certified, "")
+        return Summary(run, None, None, f"its data are not those of a run: {error!r}")
+    return Summary(run, status, certified, "")
 
 
 def _below(root: Path) -> Iterator[Found]:
@@ -165,7 +165,9 @@ def _run_folders(folder: Path, deeper: int) -> Iterator[Path]:
         if holds_run(folder):
             yield folder
             return
-        inside = [one.name for one in os.scandir(folder) if one.is_dir(follow_symlinks=False) and one.name[:1] != "."]
+        inside = [
+            entry.name for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False) and entry.name[:1] != "."
+        ]
     except (OSError, ServiceError):
         return  # it was deleted meanwhile, or is not ours to read
     if deeper:

@@ -80,8 +80,8 @@ class Site:
         return HTMLResponse(pages.shell("Runs", "/events/list"))
 
     async def _run(self, request: Request) -> Response:
-        found = await self._found(request.path_params["key"])
-        return HTMLResponse(pages.shell(found.name, f"/events/run/{found.key}", f"/run/{found.key}"))
+        run = await self._found(request.path_params["key"])
+        return HTMLResponse(pages.shell(run.name, f"/events/run/{run.key}", f"/run/{run.key}"))
 
     async def _compare(self, request: Request) -> Response:
         return HTMLResponse(pages.shell("Comparison", f"/events/compare?{request.url.query}"))
@@ -119,51 +119,51 @@ class Site:
             case ["list"]:
                 return pages.draw_list(self._runs), None
             case ["run", key]:
-                found = await self._found(key)
-                reading = Reading(found)
-                return pages.draw_run(self._runs, found, reading), reading
+                run = await self._found(key)
+                reading = Reading(run)
+                return pages.draw_run(self._runs, run, reading), reading
             case ["compare"]:
                 keys = list(dict.fromkeys(request.query_params.getlist("run")))[:MOST_COMPARED]
-                compared = [(found, Reading(found)) for found in [await self._found(key) for key in keys]]
+                compared = [(run, Reading(run)) for run in [await self._found(key) for key in keys]]
                 return pages.draw_comparison(compared, request.query_params.getlist("group_by")), None
         raise HTTPException(404)
 
     async def _found(self, key: str) -> Found:
-        found = await _in(_READING, lambda: self._runs.get(key))
-        if found is None:
+        run = await _in(_READING, lambda: self._runs.get(key))
+        if run is None:
             raise HTTPException(404, "there is no such run below the folders that are watched")
-        return found
+        return run
 
     async def _cell(self, request: Request) -> Response:
         """The path of an elite, and the call that evaluates it."""
-        found, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
-        return JSONResponse(await _answer(_READING, lambda: self._details(found, cell)))
+        run, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
+        return JSONResponse(await _answer(_READING, lambda: self._details(run, cell)))
 
-    def _details(self, found: Found, cell: int) -> dict[str, Any]:
-        data = self._data(found)
+    def _details(self, run: Found, cell: int) -> dict[str, Any]:
+        data = self._data(run)
         if data.map is None or cell not in data.map.cell_N:
             raise HTTPException(404, "this cell is empty")
         try:
             part = elite_part(cell)
-            paths = {cell: open_run(found.folder).parts(wanted=lambda name: name == part)[1][part][TRACE]}
+            paths = {cell: open_run(run.folder).parts(wanted=lambda name: name == part)[1][part][TRACE]}
         except (ServiceError, KeyError):  # it is damaged, which the page says
             paths = {}
-        return cell_details(replace(data, paths=paths), cell, self._evaluate(found.folder))
+        return cell_details(replace(data, paths=paths), cell, self._evaluate(run.folder))
 
     async def _replay(self, request: Request) -> Response:
-        found, which = await self._found(request.path_params["key"]), request.path_params["which"]
+        run, which = await self._found(request.path_params["key"]), request.path_params["which"]
         async with self._recording:
             if await request.is_disconnected():  # the viewer has chosen another cell meanwhile
                 return Response(status_code=409)
-            return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(found, which)))
+            return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(run, which)))
 
-    def _recorded(self, found: Found, which: str) -> dict[str, Any]:
+    def _recorded(self, run: Found, which: str) -> dict[str, Any]:
         """The section of a replay, of "best", "certified" or the elite of a cell, and what its script needs."""
-        data = self._data(found)
+        data = self._data(run)
         named = {"best": data.best, CERTIFIED: data.certified and data.certified.number}
         cells = [] if which in named else [_place(data, which)]
         since = named[which] if which in named else _generation(data, int(which))
-        name = (found.key, data.meta.run_id, which, since)
+        name = (run.key, data.meta.run_id, which, since)
         if name not in self._replays:
             best, certified = which == "best", which == CERTIFIED
             section = replay_section(data, best=best, cells=cells, certified=certified, trusted=self._trusted)
@@ -172,10 +172,10 @@ class Site:
             self._replays[name] = {"html": section["section"], "data": section["scripts"]}
         return self._replays[name]
 
-    def _data(self, found: Found) -> RunData:
+    def _data(self, run: Found) -> RunData:
         """The run as an open page shows it, else as it is."""
-        require_inside(found)
-        reading = self._readings.get(f"run/{found.key}") or Reading(found)
+        require_inside(run)
+        reading = self._readings.get(f"run/{run.key}") or Reading(run)
         if reading.data is None:
             reading.update()
         assert reading.data is not None

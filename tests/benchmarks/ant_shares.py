@@ -50,7 +50,7 @@ def main() -> None:
                 state = step(state, ACTION)
             jax.block_until_ready(state)
             rates[name].append(BATCH * STEPS / (time.perf_counter() - started))
-    print(json.dumps({name: round(statistics.median(found)) for name, found in rates.items()}))
+    print(json.dumps({name: round(statistics.median(values)) for name, values in rates.items()}))
 
 
 if __name__ == "__main__":

@@ -80,12 +80,12 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
             budget = (f"budget.{name}={value}" for name, value in limits)
             fixed = ("compute.engine=inline", "compute.workers=1", f"seed={wanted.seed}")
             api.run_or_resume(api.load_config(wanted.config, (*fixed, *budget, *wanted.settings)), folder)
-            if number > max((one.number for one in certified_policies(folder)), default=-1):
+            if number > max((policy.number for policy in certified_policies(folder)), default=-1):
                 certify_run(folder, workers=1)
     run = api.open_run(folder)
     rows = []
-    for one in certified_policies(folder):
-        then = run.history[run.history.env_steps >= wanted.marks[one.number]].iloc[0]
+    for policy in certified_policies(folder):
+        then = run.history[run.history.env_steps >= wanted.marks[policy.number]].iloc[0]
         of_run = {
             "task": run.config["task"]["environment"],
             "method": run.config["search"]["algorithm"],
@@ -94,7 +94,7 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
             "env_steps": int(then.env_steps),
             "seconds": round(float(then.wall_clock_s)),
         }
-        rows.append(of_run | one.row() | {"cpu": cpu_kind(), "commit": code})
+        rows.append(of_run | policy.row() | {"cpu": cpu_kind(), "commit": code})
     return pd.DataFrame(rows)
 
 
@@ -122,7 +122,10 @@ def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
     """Those that have no row at their last mark."""
     known = {(row.settings, row.seed): row.env_steps for row in table.itertuples()}
     return [
-        one for one in wanted if known.get((" ".join([one.config.stem, *one.settings]), one.seed), 0) < one.marks[-1]
+        wanted_run
+        for wanted_run in wanted
+        if known.get((" ".join([wanted_run.config.stem, *wanted_run.settings]), wanted_run.seed), 0)
+        < wanted_run.marks[-1]
     ]
 
 

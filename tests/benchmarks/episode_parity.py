@@ -57,15 +57,15 @@ def episodes(spec: WorkerSpec, centre: Centre, pairs: int) -> dict[str, np.ndarr
     from workers.worker import make_worker
 
     worker = make_worker(spec)
-    found = []
+    results = []
     for chunk in range(pairs // spec.chunk_pairs):
         result = worker([(centre, TrainingChunk(1, chunk))])[0]
         assert isinstance(result, EpisodesResult)
-        found.append(result)
-    descriptor = np.concatenate([result.descriptor.reshape(-1, 2) for result in found])
+        results.append(result)
+    descriptor = np.concatenate([result.descriptor.reshape(-1, 2) for result in results])
     return {
-        "return": np.concatenate([result.returns.ravel() for result in found]),
-        "length": np.concatenate([result.steps.ravel() for result in found]),
+        "return": np.concatenate([result.returns.ravel() for result in results]),
+        "length": np.concatenate([result.steps.ravel() for result in results]),
         "x": descriptor[:, 0],
         "y": descriptor[:, 1],
     }
@@ -74,14 +74,14 @@ def episodes(spec: WorkerSpec, centre: Centre, pairs: int) -> dict[str, np.ndarr
 def compare(task: str, pairs: int) -> list[dict]:
     """A row for each quantity."""
     config, centre = walking_centre(task)
-    spec, found, seconds = worker_spec(config, task_of(config)), {}, {}
+    spec, quantities, seconds = worker_spec(config, task_of(config)), {}, {}
     for rollout in ("simd", "xla"):
         started = time.perf_counter()
-        found[rollout] = episodes(replace(spec, rollout=rollout), centre, pairs)
+        quantities[rollout] = episodes(replace(spec, rollout=rollout), centre, pairs)
         seconds[rollout] = time.perf_counter() - started
     rows = []
-    for name, ours in found["simd"].items():
-        theirs = found["xla"][name]
+    for name, ours in quantities["simd"].items():
+        theirs = quantities["xla"][name]
         error = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / ours.size)
         test = ks_2samp(ours, theirs)
         rows.append({

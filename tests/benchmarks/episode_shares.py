@@ -57,12 +57,12 @@ def run_of(functions: list[FunctionBuilder], call: str, parameters: list[str]) -
 
     def seconds(*arrays: np.ndarray, unit: float = 0.0, times: int = REPEATS) -> float:
         assert alive
-        found = []
+        durations = []
         for _ in range(5):
             started = time.perf_counter()
             function(*(array.ctypes.data for array in arrays), unit, times)
-            found.append(time.perf_counter() - started)
-        return min(found) / times
+            durations.append(time.perf_counter() - started)
+        return min(durations) / times
 
     return seconds
 
@@ -160,10 +160,10 @@ def read_gbytes(kib: float) -> float:
 
     def body(number: str, carried: list[str]) -> list[str]:
         loaded = [sums.load(floats, "%from", sums.index((number, 8), (k, 1))) for k in range(8)]
-        return [sums.value(f"fadd {floats} {one}, {new}") for one, new in zip(carried, loaded, strict=True)]
+        return [sums.value(f"fadd {floats} {total}, {new}") for total, new in zip(carried, loaded, strict=True)]
 
-    for k, one in enumerate(sums.loop(vectors // 8, body, [(floats, "zeroinitializer")] * 8)):
-        sums.store(floats, one, "%to", k)
+    for k, total in enumerate(sums.loop(vectors // 8, body, [(floats, "zeroinitializer")] * 8)):
+        sums.store(floats, total, "%to", k)
     memory, out = aligned((vectors, target.width)), aligned((8, target.width))
     memory[:] = 0
     seconds = run_of([sums], "call void @read(ptr %from, ptr %to)", ["from", "to"])(memory, out)

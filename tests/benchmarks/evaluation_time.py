@@ -56,8 +56,8 @@ def main() -> None:
     print(f"{'config':<24} {'training':>9} {'16 episodes':>12} {'those wanted':>13}")
     places = ("kernel", "compiled", "rollout")
     patches = [patch(f"workers.simd.episodes.{place}.host_target", lambda: target) for place in places]
-    for one in patches:
-        one.start()
+    for patcher in patches:
+        patcher.start()
     for name in CONFIGS:
         training, whole, wanted = milliseconds(Path(__file__).parents[2] / "configs" / f"{name}.yaml")
         print(f"{name.removeprefix('paper/'):<24} {training:>9.1f} {whole:>12.1f} {wanted:>13.1f}", flush=True)

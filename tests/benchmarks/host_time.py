@@ -80,10 +80,10 @@ def ant(rounds: int, steps: int) -> None:
                 rates[name].append(LANES * steps / (time.process_time() - before))
     first = rates["host, one chunk of 16 episodes"]
     print("| what | steps a second of a core, median | host beside it |\n| --- | --- | --- |")
-    for name, found in rates.items():
-        ratios = [ours / theirs for ours, theirs in zip(first, found, strict=True)]
+    for name, values in rates.items():
+        ratios = [ours / theirs for ours, theirs in zip(first, values, strict=True)]
         spread = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
-        print(f"| {name} | {statistics.median(found):,.0f} | {spread} |")
+        print(f"| {name} | {statistics.median(values):,.0f} | {spread} |")
 
 
 def _ours(shape: PolicySpec, parameters_D: np.ndarray, steps: int) -> Callable[[], object]:
@@ -163,8 +163,8 @@ def sleep(generations: int, nodes: int, cores: int, calls: int) -> None:
         history = open_run(run).history
         seconds = history.seconds_rollout.iloc[1:]
         print(f"| generation | seconds of {calls} calls | share of {nodes * cores} times one |\n| --- | --- | --- |")
-        for generation, one in seconds.items():
-            print(f"| {generation} | {one:.2f} | {calls * SLEEP_S / (nodes * cores) / one:.0%} |")
+        for generation, duration in seconds.items():
+            print(f"| {generation} | {duration:.2f} | {calls * SLEEP_S / (nodes * cores) / duration:.0%} |")
         print(f"workers: {history.workers.iloc[-1]}")
 
 

@@ -66,7 +66,7 @@ def main() -> None:
     print(f"{'task':<12} {'hidden':<16} {'rank':>4} {'steps/s':>10} {'ratio':>6} {'gradient, ms':>13} {'ratio':>6}")
     for task, hidden in CASES.items():
         both = [timers(task, hidden, rank, rollout) for rank in RANKS]
-        rounds = np.array([[[one() for one in pair] for pair in both] for _ in range(1 + ROUNDS)])
+        rounds = np.array([[[timer() for timer in pair] for pair in both] for _ in range(1 + ROUNDS)])
         (rate, block), *_ = medians = np.median(rounds[1:], axis=0)  # the first round compiles
         for rank, (steps, milliseconds) in zip(RANKS, medians, strict=True):
             named = f"{task:<12} {'x'.join(map(str, hidden)):<16} {rank or 'full':>4}"

@@ -160,8 +160,8 @@ def main() -> None:
                 place = Path(folder) / "run"
                 for step in (fill, measure):  # each in a process of its own, for its own peak of memory
                     with context.Pool(1) as pool:
-                        found = pool.apply(step, (place, *case))
-                print(json.dumps(found), flush=True)
+                        result = pool.apply(step, (place, *case))
+                print(json.dumps(result), flush=True)
 
 
 if __name__ == "__main__":

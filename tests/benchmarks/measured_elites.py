@@ -43,9 +43,9 @@ def corrected(run: Run, episodes: int) -> dict[str, float]:
     """Coverage, QD-score and best fitness of the elites' means over fresh episodes."""
     chosen = evaluation.candidates(run, best=False, centre=False, cells=[], every=True)
     cells: dict[int, float] = {}
-    for one in evaluation.evaluate(run, chosen, episodes):
-        if one.cell is not None and np.isfinite(one.mean):
-            cells[one.cell] = max(one.mean, cells.get(one.cell, -np.inf))
+    for result in evaluation.evaluate(run, chosen, episodes):
+        if result.cell is not None and np.isfinite(result.mean):
+            cells[result.cell] = max(result.mean, cells.get(result.cell, -np.inf))
     offset = run.constants["map.qd_offset"]
     return {
         "corrected_coverage": len(cells) / run.behaviour_map.geometry.size,
@@ -70,7 +70,7 @@ def measured(kind: str, seed: int, steps: int, folder: Path, overrides: list[str
     seconds = time.monotonic() - begun
     last = run.history.iloc[-1]
     stored = {name: float(last[name]) for name in ("coverage", "qd_score", "map_fitness_max", "best_fitness")}
-    found = corrected(run, FRESH_EPISODES)
+    corrected_values = corrected(run, FRESH_EPISODES)
     [best] = certify_run(folder)
     return {
         "kind": kind,
@@ -81,7 +81,7 @@ def measured(kind: str, seed: int, steps: int, folder: Path, overrides: list[str
         "kept": len(run.parts()[1].get("whole_kept", {}).get("serial_K", run.map)),
         "samples": float(run.map["samples"].mean()) if "samples" in run.map else 1.0,
         **stored,
-        **found,
+        **corrected_values,
         "certified": float(best.episodes.values()["return_mean"]),
         "successes": best.episodes.values().get("successes"),
         "seconds": seconds,

@@ -131,8 +131,8 @@ def fresh_fitness(run: Run) -> float | None:
     if run.config["task"]["environment"] in DISTANCE_TASKS:
         return None
     chosen = evaluation.candidates(run, best=True, centre=False, cells=(), every=False)
-    [found] = evaluation.evaluate(run, chosen, FRESH_EPISODES, workers=1)
-    return round(found.mean, 2)
+    [result] = evaluation.evaluate(run, chosen, FRESH_EPISODES, workers=1)
+    return round(result.mean, 2)
 
 
 def commit() -> str:
@@ -154,8 +154,15 @@ def missing(wanted: list[Wanted], table: pd.DataFrame, curves: pd.DataFrame) -> 
     drawn = {(f"{row.task}_{row.method}", row.seed) for row in curves[list(paper_tables.RUN)].itertuples()}
     steps = {(f"{row.task}_{row.method}", row.seed): row.env_steps for row in table.itertuples()}
     known = {run: steps[run] for run in steps.keys() & drawn}
-    left = [one for one in wanted if known.get((one.config.stem, one.seed), 0) < one.env_steps]
-    return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
+    left = [
+        wanted_run
+        for wanted_run in wanted
+        if known.get((wanted_run.config.stem, wanted_run.seed), 0) < wanted_run.env_steps
+    ]
+    return sorted(
+        left,
+        key=lambda wanted_run: (-wanted_run.env_steps, wanted_run.config.stem.startswith("point"), wanted_run.seed),
+    )
 
 
 def compute(
@@ -179,14 +186,14 @@ def compute(
     with ProcessPoolExecutor(cores(), mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         while running or (left and not stopped):
             while left and not stopped and len(running) < cores():  # the pool gets no run that would have to wait
-                one = left.pop(0)
-                running[pool.submit(run, one)] = one
+                wanted_run = left.pop(0)
+                running[pool.submit(run, wanted_run)] = wanted_run
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                one = running.pop(future)
+                wanted_run = running.pop(future)
                 if isinstance(future.exception(), Interrupted):
                     continue
                 if keep(future.result()):
-                    shutil.rmtree(folder / one.name)
+                    shutil.rmtree(folder / wanted_run.name)
 
 
 def keep_run(run: Computed) -> bool:

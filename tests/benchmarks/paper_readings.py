@@ -63,22 +63,22 @@ def readings(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> dic
     A reading is that of the last generation that ended by then; none if the run has fewer steps than 98 percent of
     them, since a run ends within a generation of its limit.
     """
-    found = measured(task, evaluations, history)
-    steps, rows = found["env_steps"], read_at(found, AT)
+    measurements = measured(task, evaluations, history)
+    steps, rows = measurements["env_steps"], read_at(measurements, AT)
     columns: dict[str, Any] = {
         column(name, at): None if np.isnan(rows.at[at, name]) else rows.at[at, name] for at in AT for name in READINGS
     }
     if task in DISTANCE_TASKS:
         for name in READINGS:
-            there = steps[found[name] >= -GOAL_M]
+            there = steps[measurements[name] >= -GOAL_M]
             columns[f"steps_to_goal_{name}"] = int(there.iloc[0]) if len(there) else None
     return columns
 
 
 def curve(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> pd.DataFrame:
     """env_steps, centre and single of a run at the points of `CURVE_AT` that it has reached."""
-    found = read_at(measured(task, evaluations, history), CURVE_AT)
-    return found.dropna(subset=list(READINGS)).rename_axis("env_steps").reset_index()
+    rows = read_at(measured(task, evaluations, history), CURVE_AT)
+    return rows.dropna(subset=list(READINGS)).rename_axis("env_steps").reset_index()
 
 
 def read_at(found: pd.DataFrame, points: tuple[int, ...]) -> pd.DataFrame:

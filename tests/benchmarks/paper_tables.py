@@ -119,7 +119,7 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
                 cells.append(_quartiles(of_method["fresh"]))
             if with_goal:
                 steps = pd.to_numeric(of_method["steps_to_goal_single"]).tolist()
-                cells.append(", ".join("never" if np.isnan(one) else f"{one / 1e6:,.0f} M" for one in steps))
+                cells.append(", ".join("never" if np.isnan(count) else f"{count / 1e6:,.0f} M" for count in steps))
             lines.append(_line(cells))
     short = runs[~runs.finished.astype(bool)]
     if len(short):

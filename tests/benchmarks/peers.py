@@ -199,20 +199,20 @@ KINDS = {"rollouts": our_rollouts, "physics": our_physics, "search": our_search,
 
 def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Comparison], to: Path) -> list[dict]:
     """Rows of all measurements, written to a table after each."""
-    programs = [name for name in dict.fromkeys(one.program for one in chosen) if there_are(folder, name)]
-    chosen = [one for one in chosen if one.program in programs]
+    programs = [name for name in dict.fromkeys(choice.program for choice in chosen) if there_are(folder, name)]
+    chosen = [choice for choice in chosen if choice.program in programs]
     named = {name: their_versions(folder, name) for name in programs}
-    theirs = {name: ", ".join(f"{key} {found[key]}" for key in NAMED[name]) for name, found in named.items()}
+    theirs = {name: ", ".join(f"{key} {version_of[key]}" for key in NAMED[name]) for name, version_of in named.items()}
     ours = f"{OURS} {platform_info()['es-service']}, jax {platform_info()['jax']}"
     rows: list[dict[str, Any]] = []
 
     def measured(number: int, comparison: Comparison, program: str, request: Mapping[str, Any]) -> dict[str, Any]:
         if program == OURS:
-            found = asked([sys.executable, "-m", "tests.benchmarks.peers", "--measure"], request, **same_imports())
+            result = asked([sys.executable, "-m", "tests.benchmarks.peers", "--measure"], request, **same_imports())
         else:
-            found = asked([python_of(folder, program), "-I", THEIRS], request)
+            result = asked([python_of(folder, program), "-I", THEIRS], request)
         versions = ours if program == OURS else theirs[program]
-        row = {"round": number, "program": program, "what": comparison.what, **found}
+        row = {"round": number, "program": program, "what": comparison.what, **result}
         rows.append(row | {"cpu": cpu_kind(), "versions": versions})
         pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(to, index=False, float_format="%.6g", lineterminator="\n")
         print(json.dumps(row), flush=True)
@@ -222,17 +222,17 @@ def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Compa
         return {**request} if "generations" in request else {**request, "seconds": seconds}
 
     requests = []
-    for one in chosen:
-        request = timed(one.theirs)
-        if one.batches:
-            tried = [request | {"batch": batch} for batch in one.batches]
-            request = max(tried, key=lambda asking: measured(0, one, one.program, asking)["env_steps_per_second"])
-        requests.append((one, request))
+    for choice in chosen:
+        request = timed(choice.theirs)
+        if choice.batches:
+            tried = [request | {"batch": batch} for batch in choice.batches]
+            request = max(tried, key=lambda asking: measured(0, choice, choice.program, asking)["env_steps_per_second"])
+        requests.append((choice, request))
     for number in range(1, rounds + 1):
-        for one, request in requests:
-            sides = [(one.program, request), (OURS, timed(one.ours))]
+        for choice, request in requests:
+            sides = [(choice.program, request), (OURS, timed(choice.ours))]
             for program, asking in sides if number % 2 else sides[::-1]:
-                measured(number, one, program, asking)
+                measured(number, choice, program, asking)
     return rows
 
 
@@ -241,13 +241,13 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     table = pd.DataFrame(rows, columns=list(COLUMNS)).query("round > 0")
     median = table.assign(ours=table["program"] == OURS).groupby(["what", "ours"])[list(RATES)].median()
     lines = [f"{'what':<44}{'column':<26}{'theirs':>14}{'ours':>14}{'times as fast':>15}"]
-    for one in COMPARISONS:
-        for column in RATES if one.what in median.index else ():
-            theirs, ours = median[column][one.what, False], median[column][one.what, True]
+    for comparison in COMPARISONS:
+        for column in RATES if comparison.what in median.index else ():
+            theirs, ours = median[column][comparison.what, False], median[column][comparison.what, True]
             ratio = theirs / ours if column == "ms_per_generation" else ours / theirs
-            times = f"{ratio:.2f}" if column == one.column else ""
+            times = f"{ratio:.2f}" if column == comparison.column else ""
             if not np.isnan([theirs, ours]).any():
-                lines.append(f"{one.what:<44}{column:<26}{theirs:>14,.1f}{ours:>14,.1f}{times:>15}")
+                lines.append(f"{comparison.what:<44}{column:<26}{theirs:>14,.1f}{ours:>14,.1f}{times:>15}")
     return "\n".join(lines)
 
 
@@ -267,9 +267,9 @@ def main() -> None:
     elif arguments.build:
         build(folder)
     else:
-        chosen = [one for one in COMPARISONS if arguments.only in one.what]
+        chosen = [comparison for comparison in COMPARISONS if arguments.only in comparison.what]
         if not chosen:
-            names = "; ".join(one.what for one in COMPARISONS)
+            names = "; ".join(comparison.what for comparison in COMPARISONS)
             parser.error(f"--only {arguments.only!r}: no comparison has this in its name; there are: {names}")
         print(summary(take_turns(folder, arguments.rounds, arguments.seconds, chosen, arguments.results)))
 

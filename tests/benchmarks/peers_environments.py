@@ -75,16 +75,16 @@ def their_versions(folder: Path, name: str) -> dict[str, str]:
     try:
         if not python.exists():
             raise RuntimeError("it does not exist")
-        found = asked([python, "-I", THEIRS], {"kind": "versions", "program": name, "packages": list(pins)})
+        versions = asked([python, "-I", THEIRS], {"kind": "versions", "program": name, "packages": list(pins)})
         if wrong := [
-            f"{package} {found[package]}, not {pin}" for package, pin in pins.items() if found[package] != pin
+            f"{package} {versions[package]}, not {pin}" for package, pin in pins.items() if versions[package] != pin
         ]:
             raise RuntimeError("it has " + ", ".join(wrong))
     except RuntimeError as error:
         why = str(error).splitlines()[-1]
         way_out = f"python -m tests.benchmarks.peers --build --environments {folder}"
         raise SystemExit(f"{folder / name} is not the environment of {name}: {why}\nTo build it: {way_out}") from None
-    return found
+    return versions
 
 
 def there_are(folder: Path, name: str) -> bool:

@@ -190,8 +190,8 @@ def _steps(envs: Any, count: int, seconds: float) -> float:
     envs.reset()
 
     def call() -> None:
-        for one in actions:
-            envs.step(one)
+        for action in actions:
+            envs.step(action)
 
     return per_second(call, len(actions) * count, seconds)
 

@@ -68,7 +68,7 @@ class Inventing:
         if self._workers and work:
             frames = map(_frames, _halves(work), self._workers)
             self.sent_bytes.append(sum(len(frame) for of_worker in frames for frame in of_worker))
-        return [self._answer(*one) for one in work]
+        return [self._answer(*subject_chunk) for subject_chunk in work]
 
     def _answer(self, subject, chunk):
         slots_L = len(slots(subject, chunk)[0]) if isinstance(chunk, PolicyChunk) else chunk.episodes
@@ -191,9 +191,9 @@ def measure(batch: int, generations: int, place: Path, given: argparse.Namespace
         sent = round(float(np.median(evaluator.sent_bytes[1 + FILLING :])) / 1e3, 1)
         return {"batch": batch, "kB": sent, "digest": digest_of(checked_parts(place)[0])[:12]}
     ms = {name: 1e3 * np.diff([row.get(name, 0.0) for row in rows])[FILLING - 1 :] for name in items}
-    found = {name: round(float(np.median(values)), 2) for name, values in ms.items()}
+    medians = {name: round(float(np.median(values)), 2) for name, values in ms.items()}
     whole = round(float(np.median(np.sum(list(ms.values()), axis=0))), 2)
-    return {"batch": batch, **found, "whole": whole, "digest": digest_of(checked_parts(place)[0])[:12]}
+    return {"batch": batch, **medians, "whole": whole, "digest": digest_of(checked_parts(place)[0])[:12]}
 
 
 def main() -> None:

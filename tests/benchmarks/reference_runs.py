@@ -136,13 +136,13 @@ def contents(run: Path) -> dict[str, np.ndarray]:
     """Every array of the newest state, and every numeric history column."""
     from es_service import open_run
 
-    found = open_run(run)
+    opened_run = open_run(run)
     arrays = {
         f"state/{part}/{name}": values
-        for part, values_of in found.parts()[1].items()
+        for part, values_of in opened_run.parts()[1].items()
         for name, values in values_of.items()
     }
-    for column, values in found.history.items():
+    for column, values in opened_run.history.items():
         if column not in NOT_REPEATED and not str(column).startswith("seconds_"):
             arrays[f"history/{column}"] = values.to_numpy(np.float64, na_value=np.nan)
     return arrays
@@ -154,8 +154,8 @@ def compare(before: Path, after: Path) -> bool:
     for name in REFERENCES:
         old, new = (renamed(np.load(folder / f"{name}.npz")) for folder in (before, after))
         names = sorted({*old, *new})
-        other = [one for one in names if one not in old or one not in new or not same(old[one], new[one])]
-        values = sum(new[one].size for one in new)
+        other = [key for key in names if key not in old or key not in new or not same(old[key], new[key])]
+        values = sum(new[key].size for key in new)
         generations = len(new["history/env_steps"]) - 1
         verdict = f"differ in {', '.join(other)}" if other else "equal"
         print(f"{name:<18}{generations:>5} generations {len(names):>6} arrays {values:>12,} values  {verdict}")

@@ -99,8 +99,8 @@ def compare_policies(task: str, seconds: float, rounds: int) -> dict[str, Any]:
             for length in (0.0, *[seconds] * rounds):  # the first compiles
                 rates["perturbed"].append(measure(engine, point, chunks, length))
                 rates["explicit"].append(measure_policies(engine, policies_N_D, size, length))
-        rate = {kind: statistics.median(found[1:]) for kind, found in rates.items()}
-        row |= {f"{kind}_{workers}": round(found) for kind, found in rate.items()}
+        rate = {kind: statistics.median(values[1:]) for kind, values in rates.items()}
+        row |= {f"{kind}_{workers}": round(median) for kind, median in rate.items()}
         row[f"explicit_over_perturbed_{workers}"] = round(rate["explicit"] / rate["perturbed"], 2)
     return row
 
@@ -130,11 +130,11 @@ def compare(task: str, seconds: float, rounds: int, *, threads: bool) -> dict[st
             rollout: max(resident_mib(pid) for pid in engines[rollout, 2].transport.process_ids().values())
             for rollout in ("xla", "simd")
         }
-    rate = {kind: statistics.median(found) for kind, found in rates.items()}
+    rate = {kind: statistics.median(values) for kind, values in rates.items()}
     ratios = {n: [s / x for s, x in zip(rates["simd", n], rates["xla", n], strict=True)] for n in (1, 2)}
     return {
         "task": task,
-        **{f"{rollout}_{workers}": round(found) for (rollout, workers), found in rate.items()},
+        **{f"{rollout}_{workers}": round(median) for (rollout, workers), median in rate.items()},
         "simd_over_xla": [round(rate["simd", workers] / rate["xla", workers], 1) for workers in (1, 2)],
         "simd_over_xla_least_and_greatest": [
             [round(pick(ratios[workers]), 1) for pick in (min, max)] for workers in (1, 2)

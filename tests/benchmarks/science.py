@@ -181,14 +181,14 @@ def quartiles(table: pd.DataFrame) -> pd.DataFrame:
 
 def table_of(found: Sequence[dict[str, Any]]) -> pd.DataFrame:
     """A row per run."""
-    return pd.DataFrame([one["row"] for one in found]).astype({"steps_to_minus_30": "Int64"})
+    return pd.DataFrame([run["row"] for run in found]).astype({"steps_to_minus_30": "Int64"})
 
 
 def kept_runs(kept: Path) -> list[dict[str, Any]]:
     """What is known, in the order of METHODS and seeds."""
     lines = gzip.decompress(kept.read_bytes()).splitlines() if kept.exists() else []
-    found = [json.loads(line) for line in lines]
-    return sorted(found, key=lambda one: (list(METHODS).index(one["row"]["method"]), one["row"]["seed"]))
+    runs = [json.loads(line) for line in lines]
+    return sorted(runs, key=lambda run: (list(METHODS).index(run["row"]["method"]), run["row"]["seed"]))
 
 
 def main() -> None:
@@ -202,13 +202,13 @@ def main() -> None:
     name = RECORDED.get(arguments.env_steps)
     trial = bool(arguments.set) or name is None or not set(arguments.seeds) <= set(SEEDS)
     kept = RUNS / f"{name}_runs.jsonl.gz"
-    known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs(kept)}
+    known = set() if trial else {(run["row"]["method"], run["row"]["seed"]) for run in kept_runs(kept)}
     RUNS.mkdir(parents=True, exist_ok=True)
     if not arguments.engine:
         cleaned = worker_environment(os.environ)
         os.environ.clear()
         os.environ.update(cleaned)  # the processes below import JAX with it
-    found = []
+    runs = []
     cores = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         settings = tuple(arguments.set)
@@ -220,22 +220,22 @@ def main() -> None:
         }
         try:
             for future in as_completed(pending):
-                found.append(future.result())
-                print(json.dumps(found[-1]["row"]), flush=True)
+                runs.append(future.result())
+                print(json.dumps(runs[-1]["row"]), flush=True)
                 if not trial:
                     with gzip.open(kept, "at") as file:
-                        file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
+                        file.write(json.dumps(runs[-1], separators=(",", ":")) + "\n")
                     table_of(kept_runs(kept)).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
                 shutil.rmtree(folder_of(*pending[future], arguments.env_steps, settings))
         except BaseException:  # what runs now is in its folder, to go on from; nothing else begins
             for future in pending:
                 future.cancel()
             raise
-    found = found if trial else kept_runs(kept)
-    print(quartiles(table_of(found)).to_string())
+    runs = runs if trial else kept_runs(kept)
+    print(quartiles(table_of(runs)).to_string())
     if not trial:
-        table_of(found).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
-        science_picture.draw(found, RUNS / f"{name}.png")
+        table_of(runs).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
+        science_picture.draw(runs, RUNS / f"{name}.png")
 
 
 if __name__ == "__main__":

@@ -44,13 +44,13 @@ Found = dict[str, Any]
 
 def draw(found: Sequence[Found], path: Path) -> None:
     """One maze per method, all seeds together, and beneath them the curves, one line per seed."""
-    methods = [method for method in NAMES if any(one["row"]["method"] == method for one in found)]
+    methods = [method for method in NAMES if any(run["row"]["method"] == method for run in found)]
     rows = -(-len(methods) // COLUMNS)
     figure = plt.figure(figsize=(3.0 * COLUMNS, 3.3 * rows + 3.4), layout="constrained")
     grid = figure.add_gridspec(rows + 1, COLUMNS, height_ratios=(*[1.0] * rows, 1.05))
     for number, method in enumerate(methods):
         axes = figure.add_subplot(grid[number // COLUMNS, number % COLUMNS])
-        _maze(axes, method, [one for one in found if one["row"]["method"] == method])
+        _maze(axes, method, [run for run in found if run["row"]["method"] == method])
     half = COLUMNS // 2
     returns, cells = figure.add_subplot(grid[rows, :half]), figure.add_subplot(grid[rows, half:])
     _curves(returns, found, column=1)
@@ -65,10 +65,10 @@ def draw(found: Sequence[Found], path: Path) -> None:
     plt.close(figure)
 
 
-def _maze(axes: Any, method: str, found: Sequence[Found]) -> None:
+def _maze(axes: Any, method: str, runs: Sequence[Found]) -> None:
     counts = np.zeros((BINS, BINS))
-    for one in found:
-        x, y, count = np.array(one["ends"]).T
+    for run in runs:
+        x, y, count = np.array(run["ends"]).T
         counts[x, y] += count
     shown = np.where(counts > 0, counts, np.nan).T
     axes.imshow(shown, origin="lower", extent=(-1, 1, -1, 1), cmap="YlOrBr", norm=LogNorm(), zorder=1)
@@ -87,18 +87,18 @@ def _maze(axes: Any, method: str, found: Sequence[Found]) -> None:
         ),
     ):
         axes.add_patch(wall)
-    for one in found:
-        axes.plot(*np.array(one["way"]).T, color=COLOURS[method], linewidth=1.1, zorder=3)
+    for run in runs:
+        axes.plot(*np.array(run["way"]).T, color=COLOURS[method], linewidth=1.1, zorder=3)
     axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal", xticks=(), yticks=())
-    cells = np.median([one["row"]["map_cells"] for one in found])
-    solved = sum(one["row"]["steps_to_minus_30"] is not None for one in found)
-    axes.set_title(f"{NAMES[method]}\n{solved} of {len(found)} beyond -30; {cells:.0f} cells", fontsize=10)
+    cells = np.median([run["row"]["map_cells"] for run in runs])
+    solved = sum(run["row"]["steps_to_minus_30"] is not None for run in runs)
+    axes.set_title(f"{NAMES[method]}\n{solved} of {len(runs)} beyond -30; {cells:.0f} cells", fontsize=10)
 
 
-def _curves(axes: Any, found: Sequence[Found], column: int) -> None:
-    for one in found:
-        method, curve = one["row"]["method"], np.array(one["curve"])
-        first = one["row"]["seed"] == min(o["row"]["seed"] for o in found if o["row"]["method"] == method)
+def _curves(axes: Any, runs: Sequence[Found], column: int) -> None:
+    for run in runs:
+        method, curve = run["row"]["method"], np.array(run["curve"])
+        first = run["row"]["seed"] == min(o["row"]["seed"] for o in runs if o["row"]["method"] == method)
         label = NAMES[method] if first else None
         line = {"color": COLOURS[method], "linewidth": 1.3, "alpha": 0.9, "label": label}
         axes.step(curve[:, 0] / 1e6, curve[:, column], where="post", **line)

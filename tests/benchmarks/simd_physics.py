@@ -88,14 +88,14 @@ def facts_of(task: str) -> dict:
 
     def count(region: Region, times: int) -> None:
         counts["carried"] = max(counts["carried"], len(region.carried))
-        for one in region.steps:
-            if isinstance(one, Region):
-                assert one.loop is not None
-                count(one, times * one.loop.trips)
+        for region_step in region.steps:
+            if isinstance(region_step, Region):
+                assert region_step.loop is not None
+                count(region_step, times * region_step.loop.trips)
             else:
                 counts["operations"] += times
-                name = graph.keys[one][0]
-                counts["flops"] += times * (2 if one in order.fused or name == "fma" else name in flops)
+                name = graph.keys[region_step][0]
+                counts["flops"] += times * (2 if region_step in order.fused or name == "fma" else name in flops)
 
     count(order.region, 1)
     return {"seconds": seconds, **facts._asdict(), **counts}

@@ -39,10 +39,10 @@ def counted(text: str) -> str:
     vector = ""
     for line in text.splitlines():
         lines.append(line)
-        found = OPERATION.match(line)
-        if not found or ("= call" in line and "@llvm.fma." not in line):
+        match = OPERATION.match(line)
+        if not match or ("= call" in line and "@llvm.fma." not in line):
             continue
-        value, width = found.groups()
+        value, width = match.groups()
         vector, n = f"<{width} x i32>", next(numbers)
         lines.append(f"  %bits{n} = bitcast <{width} x float> {value} to {vector}")
         for place, (mask, wanted) in enumerate(PARTS.values()):
@@ -81,8 +81,8 @@ def measure(task: str, pairs: int, sigma: float) -> dict[str, float]:
     ):
         kernel = compile_episodes(environment, worker_spec, np.arange(len(mean_O)), training=True, target=target)
     lanes = (given.reshape(-1, 4) for given in (resets, actions))
-    found = kernel.run(kernel.network.pack(centre_D), float(unit), mean_O, std_O, keys, *lanes)
-    steps = found.steps.reshape(-1, target.width).max(axis=1).sum() * target.width  # a block ends with its last lane
+    episodes = kernel.run(kernel.network.pack(centre_D), float(unit), mean_O, std_O, keys, *lanes)
+    steps = episodes.steps.reshape(-1, target.width).max(axis=1).sum() * target.width  # a block ends with its last lane
     counters = np.ctypeslib.as_array((ctypes.c_uint32 * (len(PARTS) * target.width)).from_address(places[-1]))
     sums = dict(zip(PARTS, counters.reshape(len(PARTS), -1).sum(axis=1, dtype=np.int64).tolist(), strict=True))
     return {

@@ -47,8 +47,8 @@ def main() -> None:
             with closing(make()) as envs:
                 rates[name].append(steps_per_second(envs, given.seconds))
     print("| environments | steps a second, median | lowest and highest |\n| --- | --- | --- |")
-    for name, found in rates.items():
-        print(f"| {name} | {statistics.median(found):,.0f} | {min(found):,.0f} to {max(found):,.0f} |")
+    for name, values in rates.items():
+        print(f"| {name} | {statistics.median(values):,.0f} | {min(values):,.0f} to {max(values):,.0f} |")
 
 
 def steps_per_second(envs: Any, seconds: float) -> float:
@@ -56,12 +56,12 @@ def steps_per_second(envs: Any, seconds: float) -> float:
     low, high, shape = envs.single_action_space.low, envs.single_action_space.high, envs.action_space.shape
     actions = list(_drawn(low, high, shape, 50))
     envs.reset(seed=0)
-    for one in actions[:10]:
-        envs.step(one)
+    for action in actions[:10]:
+        envs.step(action)
     calls, started = 0, time.perf_counter()
     while time.perf_counter() - started < seconds:
-        for one in actions:
-            envs.step(one)
+        for action in actions:
+            envs.step(action)
         calls += len(actions)
     return calls * envs.num_envs / (time.perf_counter() - started)
 

@@ -39,7 +39,7 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
 
         def episode(start_key, xy, key):
             def body(step, carry):
-                state, found = carry
+                state, record = carry
                 if drive == "random":
                     action = jax.random.uniform(jax.random.fold_in(key, step), (8,), minval=-1, maxval=1)
                 else:
@@ -49,26 +49,26 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
                 in_pocket = (x < 10) & (x > 0) & (y < -15) & (name == "ant_maze")
                 reward = -jnp.hypot(x - ant_maze.GOAL[0], y - ant_maze.GOAL[1])
                 now = {
-                    "deepest": jnp.maximum(found["deepest"], depth(colliders(ant.system, moved), walls)),
-                    "crossed": found["crossed"] | crosses(state.q[:2], moved.q[:2], walls),
-                    "finite": found["finite"] & jnp.isfinite(moved.q).all() & jnp.isfinite(moved.qd).all(),
-                    "off_middle": jnp.maximum(found["off_middle"], jnp.abs(moved.q[:2] - ant_maze.MIDDLE).max()),
-                    "pocket": jnp.maximum(found["pocket"], jnp.where(in_pocket, reward, -jnp.inf)),
-                    "highest": jnp.maximum(found["highest"], moved.q[2]),
+                    "deepest": jnp.maximum(record["deepest"], depth(colliders(ant.system, moved), walls)),
+                    "crossed": record["crossed"] | crosses(state.q[:2], moved.q[:2], walls),
+                    "finite": record["finite"] & jnp.isfinite(moved.q).all() & jnp.isfinite(moved.qd).all(),
+                    "off_middle": jnp.maximum(record["off_middle"], jnp.abs(moved.q[:2] - ant_maze.MIDDLE).max()),
+                    "pocket": jnp.maximum(record["pocket"], jnp.where(in_pocket, reward, -jnp.inf)),
+                    "highest": jnp.maximum(record["highest"], moved.q[2]),
                 }
                 return moved, now
 
             nothing = jnp.float32(-jnp.inf)
-            found = dict.fromkeys(("deepest", "off_middle", "pocket", "highest"), nothing)
-            found |= {"crossed": jnp.array(False), "finite": jnp.array(True)}
+            record = dict.fromkeys(("deepest", "off_middle", "pocket", "highest"), nothing)
+            record |= {"crossed": jnp.array(False), "finite": jnp.array(True)}
             state = ant.reset(start_key, (xy[0], xy[1]))
-            return jax.lax.fori_loop(0, STEPS[name], body, (state, found))[1]
+            return jax.lax.fori_loop(0, STEPS[name], body, (state, record))[1]
 
         _compiled[name, drive] = jax.jit(jax.vmap(episode))
     start_keys = stream_keys(seed, Domain.EVALUATION_RESET, 0, np.arange(BLOCK))
     keys = jax.random.split(jax.random.PRNGKey(seed), BLOCK)
-    found = _compiled[name, drive](start_keys, places_beside_walls(name, BLOCK, seed), keys)
-    return {"task": name, "drive": drive, **{what: np.asarray(values) for what, values in found.items()}}
+    records = _compiled[name, drive](start_keys, places_beside_walls(name, BLOCK, seed), keys)
+    return {"task": name, "drive": drive, **{what: np.asarray(values) for what, values in records.items()}}
 
 
 _compiled: dict[tuple[str, str], Any] = {}
@@ -86,8 +86,8 @@ def main() -> None:
         for name in STEPS:
             for number, drive in enumerate(DRIVES):
                 jobs = [(name, drive, number * blocks + block) for block in range(blocks)]
-                found = list(pool.imap(_watch, jobs))
-                joined = {what: np.concatenate([block[what] for block in found]) for what in found[0] if what not in
+                results = list(pool.imap(_watch, jobs))
+                joined = {what: np.concatenate([block[what] for block in results]) for what in results[0] if what not in
                           ("task", "drive")}  # fmt: skip
                 rows.append({
                     "task": name,

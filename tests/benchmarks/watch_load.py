@@ -43,7 +43,7 @@ def main() -> None:
 
 def measure(folder: Path, pages: int, seconds: float, rounds: int) -> None:
     program = str(Path(sys.executable).with_name("es-service"))
-    words = [program, "run", "point_maze_me_es", "--out", str(folder), *(f"--set={one}" for one in SETTINGS)]
+    words = [program, "run", "point_maze_me_es", "--out", str(folder), *(f"--set={setting}" for setting in SETTINGS)]
     driver = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     server = subprocess.Popen([program, "watch", str(folder), "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
@@ -52,15 +52,21 @@ def measure(folder: Path, pages: int, seconds: float, rounds: int) -> None:
         while not (folder / "run.db").exists() or (read_generation(folder) or 0) < 200:
             assert driver.poll() is None
             time.sleep(0.5)
-        found: dict[bool, list[dict[str, float]]] = {False: [], True: []}
+        measurements: dict[bool, list[dict[str, float]]] = {False: [], True: []}
         for turn in range(2 * rounds):
             watched = bool((turn + turn // 2) % 2)  # nobody, all, all, nobody, ...
             row = _turn(folder, address, driver.pid, server.pid, pages if watched else 0, seconds)
-            found[watched].append(row)
+            measurements[watched].append(row)
             print(json.dumps({"pages": pages if watched else 0, **row}), flush=True)
-        rate = {watched: statistics.median(one["generations_s"] for one in rows) for watched, rows in found.items()}
-        cost = {watched: statistics.median(one["run_cpu_ms"] for one in rows) for watched, rows in found.items()}
-        share = statistics.median(one["server_cores"] for one in found[True])
+        rate = {
+            watched: statistics.median(measurement["generations_s"] for measurement in rows)
+            for watched, rows in measurements.items()
+        }
+        cost = {
+            watched: statistics.median(measurement["run_cpu_ms"] for measurement in rows)
+            for watched, rows in measurements.items()
+        }
+        share = statistics.median(measurement["server_cores"] for measurement in measurements[True])
         lost = {"generations_lost_%": 100 * (1 - rate[True] / rate[False])}
         more = {"cpu_a_generation_more_%": 100 * (cost[True] / cost[False] - 1)}
         print(json.dumps(lost | more | {"server_share_of_the_machine_%": 100 * share / (os.cpu_count() or 1)}))
@@ -107,19 +113,19 @@ def _look(address: str, ended: threading.Event, received: list[int], page: int) 
 
 def _cpu_s(pid: int) -> float:
     """Seconds of the processor that a process and its descendants have used."""
-    found, parents = 0.0, {}
+    total_s, parents = 0.0, {}
     for name in filter(str.isdigit, os.listdir("/proc")):
         try:
             fields = Path(f"/proc/{name}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
         parents[int(name)] = int(fields[1]), (int(fields[11]) + int(fields[12])) * TICK_S
-    for one, (_, used_s) in parents.items():
-        above = one
+    for process, (_, used_s) in parents.items():
+        above = process
         while above not in (pid, 0, 1) and above in parents:
             above = parents[above][0]
-        found += used_s if above == pid else 0.0
-    return found
+        total_s += used_s if above == pid else 0.0
+    return total_s
 
 
 if __name__ == "__main__":

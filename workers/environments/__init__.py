@@ -109,7 +109,7 @@ class Environment:
     """Function (state, whether the episode would have succeeded in the state before) -> whether it succeeds if it ends
     in this state; always False if the task does not declare success."""
     viewer: Viewer | None = None
-    """What a replay in three dimensions needs; None if the task has no bodies."""
+    """Data for replays in three dimensions; None if the task has no bodies."""
 
 
 def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
@@ -189,13 +189,13 @@ def make_host_task(
 def settings_of_description(
     name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None
 ) -> dict[str, Any]:
-    """What of a config's choices the description of a task depends on, as plain data; of most tasks it is nothing."""
-    found: dict[str, Any] = {}
+    """The choices of a config on which the description of a task depends, as plain data; none for most tasks."""
+    settings: dict[str, Any] = {}
     if name.startswith(f"{LIBRARY}:"):
-        found["options"] = dict(options)
+        settings["options"] = dict(options)
     if is_host_task(name) and descriptor is not None:
-        found["descriptor"] = descriptor if isinstance(descriptor, str) else list(descriptor)
-    return found
+        settings["descriptor"] = descriptor if isinstance(descriptor, str) else list(descriptor)
+    return settings
 
 
 def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:

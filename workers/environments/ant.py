@@ -145,7 +145,7 @@ def observe(state: AntState) -> Any:
 
 
 def ant_viewer(system: System) -> Viewer:
-    """What a replay of an ant needs."""
+    """Data for replays of an ant."""
     return Viewer(system.mj_model, lambda state: com.to_world(system, state.centre, state.motion)[0], STEP_S)
 
 

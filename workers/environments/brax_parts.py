@@ -25,13 +25,13 @@ def check_versions() -> None:
     for package, versions in WORKS_WITH.items():
         try:
             installed = metadata.version(package)
-            found = f"{package} {installed} is installed"
+            actual = f"{package} {installed} is installed"
         except metadata.PackageNotFoundError:
-            installed, found = "", f"{package} is not installed"
+            installed, actual = "", f"{package} is not installed"
         if not installed.startswith(versions):
             required = " or ".join(f"{prefix}*" for prefix in versions)
             raise TaskError(
-                f"{found}, but {package} {required} is required: pip install -c constraints.txt brax mujoco mujoco-mjx"
+                f"{actual}, but {package} {required} is required: pip install -c constraints.txt brax mujoco mujoco-mjx"
             )
 
 

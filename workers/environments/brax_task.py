@@ -135,33 +135,36 @@ def _backends(name: str) -> tuple[str, ...]:
         near = get_close_matches(name, known, n=1)
         hint = f"; did you mean brax:{near[0]}?" if near else ""
         raise TaskError(f"brax:{name} is not in the installed Brax, which has {', '.join(known)}{hint}")
-    found, reasons = [], []
+    backends, reasons = [], []
     for backend in BACKENDS:
         try:
             _make_brax(name, backend)
         except (ValueError, NotImplementedError) as error:
             reasons.append(f"{backend}: {error}")
         else:
-            found.append(backend)
-    if not found:
+            backends.append(backend)
+    if not backends:
         raise TaskError(f"brax:{name} cannot be built with any backend: {'; '.join(reasons)}")
-    return tuple(found)
+    return tuple(backends)
 
 
 def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
     """Descriptors that a system supports: name -> (names of the dimensions, bounds). The first is the default."""
-    found: dict[str, tuple[tuple[str, ...], Bounds]] = {}
+    descriptors: dict[str, tuple[tuple[str, ...], Bounds]] = {}
     far = (-FAR, FAR)
     root = _root_coordinates(system)
     if system.link_types[0] == "f":
-        found["final_xy"] = ("x", "y"), (far, far)
+        descriptors["final_xy"] = ("x", "y"), (far, far)
     if root:
-        found["final_x"] = ("x",), (far,)
+        descriptors["final_x"] = ("x",), (far,)
     if feet := _feet(system):
-        found["feet_contact"] = tuple(f"foot_{number}" for number in range(1, len(feet) + 1)), ((0.0, 1.0),) * len(feet)
+        descriptors["feet_contact"] = (
+            tuple(f"foot_{number}" for number in range(1, len(feet) + 1)),
+            ((0.0, 1.0),) * len(feet),
+        )
     if joints := min(JOINTS, system.q_size() - root):
-        found["final_joints"] = tuple(f"joint_{number}" for number in range(1, joints + 1)), (far,) * joints
-    return found
+        descriptors["final_joints"] = tuple(f"joint_{number}" for number in range(1, joints + 1)), (far,) * joints
+    return descriptors
 
 
 def _root_coordinates(system: Any) -> int:

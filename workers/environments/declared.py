@@ -39,7 +39,7 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def import_named(path: str, what: str = "class") -> Any:
-    """What `package.module:name` names.
+    """The object `package.module:name`.
 
     Args:
         what: the word for it in messages.
@@ -51,12 +51,12 @@ def import_named(path: str, what: str = "class") -> Any:
     if problem := in_no_file(path):
         raise TaskError(problem)
     try:
-        found = import_user_module(path)
+        imported = import_user_module(path)
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
-    if not hasattr(found, name):
+    if not hasattr(imported, name):
         raise TaskError(f"{path}: the module {module} has no {what} {name}")
-    return getattr(found, name)
+    return getattr(imported, name)
 
 
 def wrong_values(task: Any, names: Any, bounds: Any, sizes: tuple[str, ...]) -> list[str]:

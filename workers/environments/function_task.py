@@ -59,26 +59,26 @@ class FunctionTask:
     call: Callable[..., Any]
 
     def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, NDArray[np.float32]]:
-        """(fitness, descriptor [B]) of what a search moves.
+        """(fitness, descriptor [B]) of search parameters.
 
         Raises whatever the function raises, and TaskError for a result of another form.
         """
         point_D = self.parameters.values(parameters_D)
-        found = self.call(point_D.copy(), **({"seed": seed} if self.takes_seed else {}))
+        result = self.call(point_D.copy(), **({"seed": seed} if self.takes_seed else {}))
         if not self.has_descriptor:
-            return _number(found, self.name), point_D[: self.descriptor_size].astype(np.float32)
-        if not (isinstance(found, tuple | list) and len(found) == 2):
-            forgotten = "; is a `return` missing?" if found is None else ""
-            raise TaskError(f"{self.name} returned {found!r}; it must return (fitness, descriptor){forgotten}")
+            return _number(result, self.name), point_D[: self.descriptor_size].astype(np.float32)
+        if not (isinstance(result, tuple | list) and len(result) == 2):
+            forgotten = "; is a `return` missing?" if result is None else ""
+            raise TaskError(f"{self.name} returned {result!r}; it must return (fitness, descriptor){forgotten}")
         try:
-            descriptor_B = np.asarray(found[1], np.float32).reshape(-1)
+            descriptor_B = np.asarray(result[1], np.float32).reshape(-1)
         except (TypeError, ValueError):
-            raise TaskError(f"{self.name} returned the descriptor {found[1]!r}; it must be numbers") from None
+            raise TaskError(f"{self.name} returned the descriptor {result[1]!r}; it must be numbers") from None
         if descriptor_B.size != self.descriptor_size:
             raise TaskError(
                 f"{self.name} returned a descriptor of {descriptor_B.size} numbers, not {self.descriptor_size}"
             )
-        return _number(found[0], self.name), descriptor_B
+        return _number(result[0], self.name), descriptor_B
 
 
 def describe(path: str) -> TaskSpec:
@@ -156,14 +156,14 @@ def _number(value: Any, name: str) -> float:
 
 def _descriptor(function: Any, parameters: ParameterSpec) -> tuple[Any, Any]:
     """Names and bounds of the descriptor."""
-    if any(hasattr(function, one) for one in DESCRIPTOR):
+    if any(hasattr(function, attribute) for attribute in DESCRIPTOR):
         return getattr(function, DESCRIPTOR[0], None), getattr(function, DESCRIPTOR[1], None)
     bounds: Bounds = tuple(finite_bounds(*pair) for pair in parameters.bounds[:SHOWN])
     return parameters.names[:SHOWN], bounds
 
 
 def _parameters(function: Any) -> tuple[ParameterSpec | None, list[str]]:
-    """What a function declares of its parameters, and what is wrong with it."""
+    """Parameters that a function declares, and problems of the declaration."""
     given = function.parameters
     if type(given) is int:
         given = tuple(f"x{index}" for index in range(given))

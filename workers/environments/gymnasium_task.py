@@ -97,14 +97,14 @@ def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
             why = users_error(error, task) or f"{type(error).__name__}: {error}"
             raise TaskError(f"{task} cannot be made with the options {dict(options)}: {why}") from error
 
-    one = construct()
-    size, flat = _observed(task, one.observation_space)
+    environment = construct()
+    size, flat = _observed(task, environment.observation_space)
     return HostTask(
         name=task,
         make=construct,
         observation_size=size,
         flat=flat,
-        actions=_acted(task, one.action_space),
+        actions=_acted(task, environment.action_space),
         descriptor_size=1,
         descriptor=length,
         success=said_success,
@@ -171,7 +171,7 @@ def _acted(task: str, space: Any) -> Callable[[Any], Any]:
         return lambda action_L_A: bounded(action_L_A).reshape(-1, *space.shape)
     if _is(space, "Discrete"):
         first = int(space.start)
-        return chosen if first == 0 else lambda action_L_A: [first + one for one in chosen(action_L_A)]
+        return chosen if first == 0 else lambda action_L_A: [first + action for action in chosen(action_L_A)]
     raise TaskError(
         f"{task} has actions of the space {space}; Box and Discrete are supported. Register the environment with a "
         "wrapper that takes one of these, such as gymnasium.wrappers.TransformAction"
@@ -182,14 +182,14 @@ def _bounds(space: Any) -> list[tuple[float, float]]:
     """Bounds of each number of a flat observation."""
     if _is(space, "Discrete"):
         return [(0.0, 1.0)] * int(space.n)
-    low_O, high_O = ([float(str(one)) for one in bound.reshape(-1)] for bound in (space.low, space.high))
+    low_O, high_O = ([float(str(number)) for number in bound.reshape(-1)] for bound in (space.low, space.high))
     return list(zip(low_O, high_O, strict=True))  # by their texts, since -1.2 in float32 is -1.2000000476837158
 
 
 def _options(made: Any, spec: Any, given: Mapping[str, OptionValue]) -> dict[str, Option]:
     """The keyword arguments that a config can set: those with a plain default, and those that it sets."""
     parameters = inspect.signature(type(made.unwrapped).__init__).parameters
-    defaults = {name: one.default for name, one in parameters.items()} | spec.kwargs
+    defaults = {name: parameter.default for name, parameter in parameters.items()} | spec.kwargs
     plain = {name: value for name, value in defaults.items() if type(value) in (bool, int, float, str)}
     for name, value in given.items():
         if name not in plain or (type(plain[name]), type(value)) == (int, float):

@@ -77,7 +77,7 @@ def describe_descriptor(
 
 
 def _of_info(key: str, size: int) -> Callable[[HostEpisode], Any]:
-    """The newest value of a key of `info` in the episode; NaN before there is one."""
+    """The newest value of a key of `info` in the episode; NaN before the first."""
     return lambda episode: episode.said.get(key, np.full(size, np.nan))
 
 

@@ -1,4 +1,4 @@
-"""Tasks of Python objects: what the rollout of such tasks steps, one object for each episode at a time.
+"""Tasks of Python objects, which their rollout steps: one object for each episode at a time.
 
 An object has a state of its own, and only `reset` starts its next episode. So its results are pure functions of the
 seed and the actions as far as the object keeps nothing from one episode to the next.
@@ -29,14 +29,14 @@ LENGTH = "length"
 
 @dataclass
 class HostEpisode:
-    """What a Python object has done in its present episode so far."""
+    """The present episode of a Python object so far."""
 
     environment: Any
     """The object itself."""
     observation_O: FloatArray
     """The newest observation, flat."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """What the object has said besides with the newest observation."""
+    """The `info` that came with the newest observation."""
     said: dict[str, Any] = field(default_factory=dict)
     """The newest value of every key that `info` has had in this episode."""
     steps: int = 0
@@ -79,8 +79,8 @@ class HostEnvironment:
 
     def reset(self, seed: int) -> FloatArray:
         """Start an episode, and return its first observation [O]."""
-        found = self._object.reset(seed=seed)
-        observation, info = found if _is_pair(found) else (found, {})
+        result = self._object.reset(seed=seed)
+        observation, info = result if _is_pair(result) else (result, {})
         self._episode = HostEpisode(self._object, self._observed(observation), info, dict(info))
         if self._task.keeps_all:
             self._episode.observations.append(self._episode.observation_O)
@@ -88,14 +88,14 @@ class HostEnvironment:
 
     def step(self, action: Any) -> tuple[FloatArray, float, bool]:
         """Do one step: (observation [O], reward, whether the episode has ended)."""
-        found = self._object.step(action)
-        if not isinstance(found, tuple | list) or len(found) not in (3, 5):
-            returned = f"{len(found)} values" if isinstance(found, tuple | list) else repr(found)
+        result = self._object.step(action)
+        if not isinstance(result, tuple | list) or len(result) not in (3, 5):
+            returned = f"{len(result)} values" if isinstance(result, tuple | list) else repr(result)
             raise TaskError(
                 f"{self._task.name}: step returned {returned}; it must return (observation, reward, done), or "
                 "(observation, reward, terminated, truncated, info)"
             )
-        observation, reward, *ends = found
+        observation, reward, *ends = result
         try:
             episode, reward = self._episode, float(reward)
         except (TypeError, ValueError):
@@ -110,7 +110,7 @@ class HostEnvironment:
 
     @property
     def info(self) -> Mapping[str, Any]:
-        """What the object has said with its newest observation besides."""
+        """The `info` that came with the newest observation."""
         return self._episode.info
 
     def descriptor(self) -> FloatArray:
@@ -204,6 +204,6 @@ def unchanged(action_L_A: FloatArray) -> FloatArray:
     return action_L_A
 
 
-def _is_pair(found: Any) -> bool:
+def _is_pair(result: Any) -> bool:
     """Whether a reset has returned (observation, info), as those of Gymnasium do."""
-    return isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Mapping)
+    return isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping)

@@ -70,17 +70,19 @@ def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
     """
     task, name = import_named(path), PREFIX + path
     needed = (*SIZES, *METHODS, *(DESCRIPTOR if hasattr(task, "descriptor") else ()))
-    if missing := [one for one in needed if not hasattr(task, one)]:
+    if missing := [attribute for attribute in needed if not hasattr(task, attribute)]:
         raise TaskError(
             f"{name} has no {', '.join(missing)}; workers/environments/python_task.py lists what such a task must have"
         )
     wrong = [
-        f"{one} = {getattr(task, one)!r} is not of type int" for one in SIZES if type(getattr(task, one)) is not int
+        f"{attribute} = {getattr(task, attribute)!r} is not of type int"
+        for attribute in SIZES
+        if type(getattr(task, attribute)) is not int
     ]
     names, bounds = descriptor_of(task)
     wrong += [
-        f"{one} = {value!r} is not of type tuple"
-        for one, value in zip(DESCRIPTOR, (names, bounds), strict=True)
+        f"{attribute} = {value!r} is not of type tuple"
+        for attribute, value in zip(DESCRIPTOR, (names, bounds), strict=True)
         if not isinstance(value, tuple)
     ]
     options, wrong_options = declared_options(task)
@@ -90,7 +92,7 @@ def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
     if wrong:
         raise TaskError(f"{name}: {'; '.join(wrong)}")
     spec = task_of_class(name, task, "python", (names, bounds), options)
-    made = make(path, {one: option.default for one, option in options.items()})
+    made = make(path, {option_name: option.default for option_name, option in options.items()})
     told = try_out(made, task.action_size)
     if not spec.success and IS_SUCCESS in told:
         spec = replace(spec, success=SUCCESS_OF_INFO)
@@ -104,7 +106,7 @@ def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
 def descriptor_of(task: Any) -> tuple[Any, Any]:
     """Names and bounds of the descriptor that a class declares; those of the length of an episode if it has none."""
     if hasattr(task, "descriptor"):
-        return tuple(getattr(task, one) for one in DESCRIPTOR)
+        return tuple(getattr(task, attribute) for attribute in DESCRIPTOR)
     return (LENGTH,), ((0.0, float(task.episode_steps)),)
 
 
@@ -113,15 +115,15 @@ def make(path: str, options: Mapping[str, OptionValue]) -> HostTask:
     kind, name = import_named(path), PREFIX + path
 
     def construct() -> Any:
-        one = kind(**options)
+        environment = kind(**options)
         for attribute in KEPT:
-            of_class, of_object = getattr(kind, attribute, None), getattr(one, attribute, None)
+            of_class, of_object = getattr(kind, attribute, None), getattr(environment, attribute, None)
             if repr(of_class) != repr(of_object):
                 raise TaskError(
                     f"{name}: its constructor changes {attribute} ({of_class!r} -> {of_object!r}), but a run uses the "
                     "value of the class; options may change only what the methods compute"
                 )
-        return one
+        return environment
 
     actions = unchanged
     if getattr(kind, "discrete_actions", False):

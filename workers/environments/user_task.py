@@ -103,7 +103,7 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
         state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
         action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
         after, reward, done = jax.eval_shape(environment.step, state, action)
-        found = {
+        shapes = {
             "observe": (jax.eval_shape(environment.observe, state).shape, (task.observation_size,)),
             "descriptor": (jax.eval_shape(environment.descriptor, state).shape, (len(task.descriptor_names),)),
             "the reward of step": (reward.shape, ()),
@@ -115,8 +115,8 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
         raise TaskError(f"{path}: {error}") from error.__cause__
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path} cannot be traced by JAX: {raised(error, path)}") from error
-    wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
-    arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
+    wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in shapes.items() if is_ != should]
+    arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state, after)]
     if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
         wrong.append(f"step returns a state of arrays {after}, but reset one of {state}; shapes and dtypes must agree")
     if wrong:

@@ -1,4 +1,4 @@
-"""What is known of the episodes of a chunk whose worker was lost, so that a user can run them alone."""
+"""Descriptions of the episodes of a chunk whose worker was lost, so that a user can run them alone."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def run_episodes(
     count, size, task = len(reset_keys_L_4), spec.policy.widths[0], lanes.task
     alive_L = np.ones(count, bool) if runs_L is None else runs_L.copy()
     environments = [lanes[lane] if alive_L[lane] else None for lane in range(count)]
-    running = [(lane, one) for lane, one in enumerate(environments) if one is not None]
+    running = [(lane, environment) for lane, environment in enumerate(environments) if environment is not None]
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     last_steps_T = np.arange(points) * spec.episode_steps // (points - 1)
     traced = frozenset() if training else frozenset(last_steps_T.tolist())
@@ -83,7 +83,7 @@ def run_episodes(
     sum_L_O, square_L_O = np.zeros((2, count, size if training else 0), np.float32)
     trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
     outputs = Outputs(spec.outputs, spec, task, count)
-    bad_reward_L: dict[int, tuple[int, float]] = {}  # of each lane with one: its first reward that is not finite
+    bad_reward_L: dict[int, tuple[int, float]] = {}  # lane -> (step, value) of its first reward that is not finite
 
     def watch(lane: int, environment: HostEnvironment) -> None:
         if watched is not None and watched.lane == lane:

@@ -29,7 +29,7 @@ from workers.environments.host_task import HostEnvironment
 STEPS = 200
 """Most steps of an episode that is compared."""
 BESIDE = 3
-"""Further objects that step beside one."""
+"""Objects that step beside the first."""
 SEED, OTHER_SEED = 1, 2
 ALONE = "alone"
 """Name of the first episode among the hashes; the others are to equal it."""
@@ -37,10 +37,10 @@ ALONE = "alone"
 
 @dataclass(frozen=True)
 class Examined:
-    """What was found of a task."""
+    """Findings about a task."""
 
     hashes: dict[str, str]
-    """What was done -> hash of all that the object returned: ALONE in a new object, and then the same once more after
+    """Trial -> hash of all that the object returned: ALONE in a new object, and then the same once more after
     another episode, and beside other objects."""
     steps_per_second: float
     """Steps of one core, or calls of a function."""
@@ -70,30 +70,30 @@ def examine(task: TaskSpec, seconds: float) -> Examined:
 
     def episodes(environments: list[HostEnvironment], seeds: list[int]) -> tuple[str, int]:
         """(hash of the first episode, steps of all) of episodes that step side by side."""
-        first_L = [one.reset(seed) for one, seed in zip(environments, seeds, strict=True)]
+        first_L = [environment.reset(seed) for environment, seed in zip(environments, seeds, strict=True)]
         said: list[Any] = [first_L[0]]
         steps, running = 0, list(range(len(environments)))
         for action in actions_T[: min(STEPS, task.episode_steps)]:
             done = set()
             for lane in running:
-                found = environments[lane].step(action)
+                result = environments[lane].step(action)
                 steps += 1
                 if lane == 0:
-                    said.append((*found, environments[0].descriptor()))
-                if found[2]:
+                    said.append((*result, environments[0].descriptor()))
+                if result[2]:
                     done.add(lane)
             running = [lane for lane in running if lane not in done]
             if not running:
                 break
         return _hash(said), steps
 
-    one = HostEnvironment(made)
-    hashes = {ALONE: episodes([one], [SEED])[0]}
-    episodes([one], [OTHER_SEED])
-    hashes["after another episode"] = episodes([one], [SEED])[0]
+    environment = HostEnvironment(made)
+    hashes = {ALONE: episodes([environment], [SEED])[0]}
+    episodes([environment], [OTHER_SEED])
+    hashes["after another episode"] = episodes([environment], [SEED])[0]
     several = [HostEnvironment(made) for _ in range(1 + BESIDE)]
     hashes["beside other objects"] = episodes(several, [SEED, *range(OTHER_SEED, OTHER_SEED + BESIDE)])[0]
-    return _measured(hashes, lambda: episodes([one], [SEED])[1], seconds)
+    return _measured(hashes, lambda: episodes([environment], [SEED])[1], seconds)
 
 
 def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -> Examined:
@@ -106,15 +106,15 @@ def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -
 
 def _hash(said: list[Any]) -> str:
     """Hash of observations, rewards, ends and descriptors, bit for bit."""
-    found = hashlib.sha256()
-    for one in said:
-        for part in one if isinstance(one, tuple) else (one,):
-            found.update(np.asarray(part).tobytes())
-    return found.hexdigest()
+    hasher = hashlib.sha256()
+    for record in said:
+        for part in record if isinstance(record, tuple) else (record,):
+            hasher.update(np.asarray(part).tobytes())
+    return hasher.hexdigest()
 
 
 def main(name: str, settings: str, seconds: str) -> None:
-    """Print what was found of a task, or the problem with it, as JSON."""
+    """Print the findings about a task, or its problem, as JSON."""
     try:
         task = described(name, json.loads(settings))
         answer: dict[str, Any] = asdict(examine(task, float(seconds)))

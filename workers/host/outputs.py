@@ -80,7 +80,7 @@ class Outputs:
         return bool(self._named)
 
     def note(self, lane: int, number: int, step: Step, *, is_last: bool) -> None:
-        """Keep what is asked of a step, the steps counted from 0."""
+        """Keep the outputs of a step; steps are counted from 0."""
         for name, kept in self.of_steps.items():
             kept[lane, number] = self._named[name].of(step)
         if is_last:

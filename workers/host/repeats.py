@@ -62,7 +62,7 @@ def does_not_repeat(task: TaskSpec) -> str:
     actions_T = made.actions(action_T_A.reshape(STEPS, task.action_size))
 
     def episode(environment: HostEnvironment, seed: int) -> list[bytes]:
-        """What each step has returned, as far as there was time."""
+        """Results of the steps, as far as there was time."""
         until, said = time.monotonic() + LONGEST_S, [environment.reset(seed).tobytes()]
         for action in actions_T[: task.episode_steps]:
             observation_O, reward, done = environment.step(action)
@@ -72,13 +72,13 @@ def does_not_repeat(task: TaskSpec) -> str:
         return said
 
     def differs(first: list[bytes], second: list[bytes]) -> bool:
-        return any(one != other for one, other in zip(first, second, strict=False))
+        return any(step != other for step, other in zip(first, second, strict=False))
 
     used = HostEnvironment(made)
     alone = episode(used, SEED)
     episode(used, OTHER_SEED)
-    found = {
+    differences = {
         "after another episode": differs(alone, episode(used, SEED)),
         "in another object": differs(alone, episode(HostEnvironment(made), SEED)),
     }
-    return " and ".join(where for where, is_other in found.items() if is_other)
+    return " and ".join(where for where, is_other in differences.items() if is_other)

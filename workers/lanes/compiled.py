@@ -34,13 +34,13 @@ Resets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint3
 
 
 class Kernels(NamedTuple):
-    """What simd has compiled of a task."""
+    """Compiled functions of a task."""
 
     begin: Kernel | None
     step: Kernel | None
     """None: xla has to compute it, and then the reset too."""
     lacks: str
-    """Why one of them is missing, as the end of a sentence; empty if none is."""
+    """Why `begin` or `step` is None, as the end of a sentence; else empty."""
 
 
 class CompiledLanes:

@@ -11,7 +11,7 @@ from workers.environments import Environment
 
 
 class Seen(NamedTuple):
-    """What a reset or a step shows of each lane."""
+    """Results of a reset or a step in each lane."""
 
     observation: Any
     """[N, O] float32, neither normalised nor clipped."""
@@ -28,7 +28,7 @@ class Seen(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What a lane remembers."""
+    """State of a lane."""
 
     state: Any
     success: Any

@@ -65,7 +65,7 @@ class BlockLanes:
 
     def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
         """See `Blocks.resets`."""
-        place_M, found = self._first + lane_M, []
+        place_M, seen_by_block = self._first + lane_M, []
         for block in np.unique(place_M // BLOCK):
             is_here_M = place_M // BLOCK == block
             here = place_M[is_here_M] % BLOCK
@@ -74,21 +74,21 @@ class BlockLanes:
             arrays, seen = self._begin(keys)
             for kept, array in zip(self._arrays, arrays, strict=True):
                 kept[place_M[is_here_M]] = np.asarray(array)[here]
-            found.append([np.asarray(array)[here] for array in seen])
-        return self._words_of(place_M), Seen(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+            seen_by_block.append([np.asarray(array)[here] for array in seen])
+        return self._words_of(place_M), Seen(*(np.concatenate(arrays) for arrays in zip(*seen_by_block, strict=True)))
 
     def step(self, action_N_A: NDArray[np.float32]) -> Seen:
         """See `Blocks.step`."""
         actions = np.zeros((len(self._arrays[0]), action_N_A.shape[1]), np.float32)
         actions[self._places] = action_N_A
-        found = []
+        seen_by_block = []
         for start in range(0, len(actions), BLOCK):
             of = slice(start, start + BLOCK)
             arrays, seen = self._step([array[of] for array in self._arrays], actions[of])
             for kept, array in zip(self._arrays, arrays, strict=True):
                 kept[of] = array
-            found.append(seen)
-        return Seen(*(np.concatenate(arrays)[self._places] for arrays in zip(*found, strict=True)))
+            seen_by_block.append(seen)
+        return Seen(*(np.concatenate(arrays)[self._places] for arrays in zip(*seen_by_block, strict=True)))
 
     def words(self) -> NDArray[np.uint32]:
         """See `Blocks.words`."""
@@ -118,7 +118,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def main(descriptor: int) -> None:
-    """Answer until the parent closes its end: None when the lanes are there, and then what is asked for."""
+    """Answer until the parent closes its end: None when the lanes are there, then the requested values."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when this ends
     with socket.socket(fileno=descriptor) as parent:
         name, *given = receive(parent)

@@ -1,1 +1,1 @@
-"""What a policy computes: network, memory and output, each once for NumPy and for JAX."""
+"""Parts of a policy: network, memory and output, each once for NumPy and for JAX."""

@@ -21,7 +21,7 @@ from es_service.protocol.policy_spec import Output
 LOG_STD = (-5.0, 2.0)
 """Limits of the log of the standard deviation of `gaussian`. Source: usual in implementations of SAC."""
 LEAST_UNIFORM = np.float32(2.0**-25)
-"""What a uniform variate of 0 counts as: half of the distance between variates."""
+"""Replacement of a uniform variate of 0: half of the distance between variates."""
 
 
 def action(xp: Any, output: Output, outputs: Any) -> Any:

@@ -44,12 +44,12 @@ def initial_memory(xp: Any, spec: PolicySpec, *axes: int) -> Any:
 def act(
     xp: Any, spec: PolicySpec, layers: Layers, memory_H: Any, observation_O: Any, dense: Dense = dense
 ) -> tuple[Any, Any]:
-    """What one step of a policy computes.
+    """Results of one step of a policy.
 
     Args:
         memory_H: the memory before the step; None for a policy without one.
         observation_O: a normalised observation.
-        dense: what computes a layer before its activation.
+        dense: function of a layer before its activation.
 
     Returns:
         (outputs of the last layer, of which `workers.policies.outputs` makes an action; the memory after the step)

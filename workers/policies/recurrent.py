@@ -31,7 +31,7 @@ def next_memory(
         candidate: (weights [in + H, H], biases [H] or None).
         memory_H: [..., H].
         x: input of the cell, [..., in].
-        dense: what computes a layer before its activation.
+        dense: function of a layer before its activation.
 
     Source: the gated recurrent unit of Cho et al. 2014 (arXiv:1406.1078), with the reset before the product.
     """

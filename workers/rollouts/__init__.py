@@ -8,6 +8,6 @@ from workers.rollouts.host import Host
 from workers.rollouts.simd import Simd
 from workers.rollouts.xla import Xla
 
-BACKENDS: dict[str, RolloutBackend] = {one.name: one for one in (Asked(), Host(), Xla(), Simd())}
+BACKENDS: dict[str, RolloutBackend] = {rollout.name: rollout for rollout in (Asked(), Host(), Xla(), Simd())}
 """Name, as in `compute.rollout` -> rollout, from the slowest to the fastest. `protocol.rollouts.choose` is what `auto`
 means."""

@@ -1,4 +1,4 @@
-"""What a rollout has to do where it runs: the functions of a worker, recordings and measurements.
+"""Interface of a rollout where it runs: the functions of a worker, recordings and measurements.
 
 A rollout is one object of this protocol in the registry of `workers.rollouts`. No other module knows it by name.
 """
@@ -26,7 +26,7 @@ class FailedEpisode(NamedTuple):
     lane: int
     """Place of its policy in the chunk: of a training chunk 2 p + s for member s of pair p, of others the slot."""
     text: str
-    """What comes after the name of the member: its seed and parameters, and the reason."""
+    """Text after the name of the member: its seed and parameters, and the reason."""
 
 
 class Episodes(NamedTuple):
@@ -56,7 +56,7 @@ class Episodes(NamedTuple):
     """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.outputs.OF_STEPS`). Rows from `steps`
     on may be anything."""
     failures: tuple[FailedEpisode, ...] = ()
-    """Those of the invalid episodes of which the rollout knows more."""
+    """Invalid episodes of which the rollout knows more."""
 
     def map(self, function: Callable[[Any], Any]) -> Episodes:
         """The episodes with a function of each array in its place."""

@@ -162,12 +162,12 @@ def _in_lanes(array: np.ndarray, lanes: int) -> np.ndarray:
 
 def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
     """Episodes [L] of each of a member's episodes as [L, E]."""
-    columns = (np.stack(arrays, axis=1) for arrays in zip(*(one[:-3] for one in by_episode), strict=True))
+    columns = (np.stack(arrays, axis=1) for arrays in zip(*(episodes[:-3] for episodes in by_episode), strict=True))
     named = (
-        {name: np.stack([one[name] for one in each], axis=1) for name in each[0]}
-        for each in ([one.outputs for one in by_episode], [one.of_steps for one in by_episode])
+        {name: np.stack([values[name] for values in each], axis=1) for name in each[0]}
+        for each in ([episodes.outputs for episodes in by_episode], [episodes.of_steps for episodes in by_episode])
     )
-    return Episodes._make([*columns, *named, tuple(failed for one in by_episode for failed in one.failures)])
+    return Episodes._make([*columns, *named, tuple(failed for episodes in by_episode for failed in episodes.failures)])
 
 
 def _recording(run: Runner, request: RecordRequest) -> Recording:

@@ -1,4 +1,4 @@
-"""What the rollouts of JAX tasks share: recording an episode that was watched, and steps with random actions."""
+"""Code shared by rollouts of JAX tasks: recording an episode that was watched, and steps with random actions."""
 
 from __future__ import annotations
 

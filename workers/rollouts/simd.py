@@ -31,7 +31,7 @@ class Simd(RolloutBackend):
     compile_s = (10, 4)
 
     def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
-        """A memory of the policy, or what the description of the task has found."""
+        """A memory of the policy, or the reason in the description of the task."""
         if policy.memory:
             return "its code of a policy has no memory (policy.memory)"
         return super().why_not(task, policy)
@@ -41,7 +41,7 @@ class Simd(RolloutBackend):
         return _why_not_here()
 
     def examine(self, task: TaskSpec) -> str:
-        """What of the task's steps cannot be compiled."""
+        """Why the task's steps cannot be compiled."""
         from workers.simd.episodes.rollout import why_not
 
         return why_not(task)

@@ -13,8 +13,8 @@ from es_service.runs.certified import Certified
 
 def print_certified(console: Console, found: list[Certified]) -> None:
     """Print a line for each policy of a certification."""
-    for one in found:
-        print_line(console, f"  {one.name:<10} {certified_line(one.row())}")
+    for policy in found:
+        print_line(console, f"  {policy.name:<10} {certified_line(policy.row())}")
 
 
 def certified_line(row: Mapping[str, Any]) -> str:

@@ -103,13 +103,13 @@ def row_of(fresh: Fresh, names: list[str], run: Path | None = None) -> dict[str,
         names: the descriptor's dimensions.
         run: the first column; None if all rows are of one run, which then have no such column.
     """
-    one = fresh.candidate
+    candidate = fresh.candidate
     return {
         **({} if run is None else {"run": str(run)}),
-        "policy": one.name,
-        "generation": one.generation,
+        "policy": candidate.name,
+        "generation": candidate.generation,
         "episodes": fresh.episodes,
-        "stored_fitness": one.stored_fitness,
+        "stored_fitness": candidate.stored_fitness,
         "fresh_fitness": fresh.mean,
         "fresh_standard_error": fresh.standard_error,
         "successes": fresh.successes,

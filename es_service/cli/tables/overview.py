@@ -27,15 +27,15 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
         folders: those of runs or of sweeps.
     """
     rows, problems = [], 0
-    for folder, found in of_each(folders, lambda run: _row(read_status(open_run(run)))):
-        if isinstance(found, ServiceError):
-            rows.append(_without_row(folder, f"error: {' '.join(found.sentence.split())}"))
+    for folder, result in of_each(folders, lambda run: _row(read_status(open_run(run)))):
+        if isinstance(result, ServiceError):
+            rows.append(_without_row(folder, f"error: {' '.join(result.sentence.split())}"))
             problems += 1
-        elif found is None:
+        elif result is None:
             output = output_of(folder)
             rows.append(_without_row(folder, NOT_STARTED + (f"; its output is in {output}" if output else "")))
         else:
-            rows.append(found)
+            rows.append(result)
     widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
     for row in (_COLUMNS, *rows):
         line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()

@@ -148,10 +148,10 @@ def _objectives(recent: Recent) -> dict[str, str]:
 def _certified(run: Run) -> dict[str, str]:
     """The policy of the newest certification, if there is one."""
     try:
-        found = newest_certified(run.folder)
+        policy = newest_certified(run.folder)
     except StoreError as error:
         return {"certified": f"not known: {error.sentence}"}
-    return {} if found is None else {"certified": f"{found.name}: {certified_line(found.row())}"}
+    return {} if policy is None else {"certified": f"{policy.name}: {certified_line(policy.row())}"}
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:

@@ -20,9 +20,9 @@ from es_service.search.algorithms.user_method import user_method
 def _shipped() -> Iterator[Method]:
     """The method of each file of this folder that has one, under the name of the file."""
     for file in pkgutil.iter_modules(__path__):
-        found = getattr(importlib.import_module(f"{__name__}.{file.name}"), file.name, None)
-        if isinstance(found, Method):
-            yield found
+        method = getattr(importlib.import_module(f"{__name__}.{file.name}"), file.name, None)
+        if isinstance(method, Method):
+            yield method
 
 
 def _by_simplicity(method: Method) -> tuple[int, str]:
@@ -33,7 +33,7 @@ def _by_simplicity(method: Method) -> tuple[int, str]:
     return len(extra) + len(settings.presets), method.name
 
 
-OURS: dict[str, Method] = {one.name: one for one in sorted(_shipped(), key=_by_simplicity)}
+OURS: dict[str, Method] = {method.name: method for method in sorted(_shipped(), key=_by_simplicity)}
 """The shipped methods, the simplest first: a config that no search uses may leave `search.algorithm` out."""
 
 

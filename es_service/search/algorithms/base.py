@@ -224,7 +224,7 @@ def in_columns(evaluations: Sequence[CentreEvaluation]) -> CentreEvaluations:
     if isinstance(evaluations, CentreEvaluations):
         return evaluations
     names = "centre", "valid", "fitness", "descriptor_B", "population_max"
-    centre_N, *columns = (np.array([getattr(one, name) for one in evaluations]) for name in names)
+    centre_N, *columns = (np.array([getattr(evaluation, name) for evaluation in evaluations]) for name in names)
     return CentreEvaluations(evaluations[0].generation, centre_N, *columns, episodes=evaluations[0].episodes)
 
 

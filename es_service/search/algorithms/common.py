@@ -216,6 +216,8 @@ def insert_into_map(state: SearchState, evaluation: CentreEvaluation) -> SearchS
             evaluation.episodes,
         )
         cell = offered if entered else NO_CELL
-    centres = [replace(one, cell=NO_CELL) if cell != NO_CELL and one.cell == cell else one for one in state.centres]
+    centres = [
+        replace(other, cell=NO_CELL) if cell != NO_CELL and other.cell == cell else other for other in state.centres
+    ]
     centres[evaluation.centre] = replace(centre, cell=cell)
     return replace(state, centres=tuple(centres), map=map_)

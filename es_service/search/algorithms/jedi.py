@@ -109,11 +109,13 @@ def jedi(config: RunConfig) -> Algorithm:
             else NearnessObjective(descriptor=tuple(target_B.tolist()), weight=weight)
             for target_B in state.extra[TARGET]
         ]
-        return tuple(population(state, one, search, objective, generation) for one, objective in enumerate(objectives))
+        return tuple(
+            population(state, emitter, search, objective, generation) for emitter, objective in enumerate(objectives)
+        )
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state, generation, extra = shared.tell(state, evaluations), evaluations[0].generation, dict(state.extra)
-        valid = [one.descriptor_B for one in evaluations if one.valid]
+        valid = [evaluation.descriptor_B for evaluation in evaluations if evaluation.valid]
         if valid:
             extra[VISITS] = extra[VISITS] + np.bincount(geometry.cells_of(np.array(valid)), minlength=geometry.size)
         if generation % search.target_generations == 0 and state.map is not None and state.map.size:
@@ -189,13 +191,13 @@ def predicted(
 def is_not_dominated(first_C: NDArray[np.float64], second_C: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether no other candidate is at least as high in both values and higher in one, [C]."""
     order = np.lexsort((-second_C, -first_C))
-    found = np.zeros(first_C.size, bool)
+    is_undominated_C = np.zeros(first_C.size, bool)
     highest, equal = -np.inf, (np.nan, np.nan)
-    for one in order:
-        values = (first_C[one], second_C[one])
+    for index in order:
+        values = (first_C[index], second_C[index])
         if values[1] > highest or values == equal:
-            found[one], highest, equal = True, max(highest, values[1]), values
-    return found
+            is_undominated_C[index], highest, equal = True, max(highest, values[1]), values
+    return is_undominated_C
 
 
 def require_model() -> None:

@@ -105,7 +105,7 @@ def map_elites(config: RunConfig) -> Algorithm:
         drawn = np.array(sorted(known))  # all of them are elites that were drawn, or else some are centres
         parent_N_2 = np.searchsorted(drawn, parent_cells(config, state, generation))
         key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(search.batch))
-        parents = [known[one] for one in drawn.tolist()]
+        parents = [known[parent] for parent in drawn.tolist()]
         rule = IsoLine(search.iso_sigma, search.line_sigma)
         return (PolicyAsk(recipes_of(rule, parents, parent_N_2, key_N_4)),)
 
@@ -175,7 +175,7 @@ def parent_rows(
     if elites.replaces == "worst":
         return first_N_2
     last_N_2 = np.searchsorted(kept.cell_K, cell_N_2, side="right") - 1
-    of_cell_K = np.searchsorted(kept.cell_K, kept.cell_K, side="right") - 1  # the least fit one of the same cell
+    of_cell_K = np.searchsorted(kept.cell_K, kept.cell_K, side="right") - 1  # the least fit policy of its cell
     share_K = kept.fitness_K - kept.fitness_K[of_cell_K]
     share_K[share_K[np.searchsorted(kept.cell_K, kept.cell_K)] == 0.0] = 1.0  # of the fittest: all are equal
     until_K = np.add.accumulate(share_K)

@@ -106,9 +106,10 @@ def me_es(config: RunConfig) -> Algorithm:
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if (generation - 1) % search.block_generations or state.map is None or not state.map.size:
             return {}
-        map_, found, how = state.map, {}, search.cell_sampling
+        map_, cells, how = state.map, {}, search.cell_sampling
         modes: list[Mode] = [
-            "exploit" if weight_of_fitness(one) else "explore" for one in objectives(state, generation)
+            "exploit" if weight_of_fitness(emitter_objective) else "explore"
+            for emitter_objective in objectives(state, generation)
         ]
         share_N = novelty_N = np.zeros(map_.size)
         if not (how == "top" or how == "score"):
@@ -120,8 +121,8 @@ def me_es(config: RunConfig) -> Algorithm:
             first, second = (float(u) for u in uniforms(key, np.arange(2, dtype=np.uint32)))
             if how == "top" or how == "score":
                 share_N = cell_shares(map_, novelty_N, mode, how, first)
-            found[emitter] = drawn_cell(map_, share_N, second)
-        return found
+            cells[emitter] = drawn_cell(map_, share_N, second)
+        return cells
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
         return tuple(

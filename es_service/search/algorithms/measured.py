@@ -102,8 +102,10 @@ def asked_again(state: SearchState, kept: KeptPolicies, rows: NDArray[np.int64])
     entries = state.extra[POLICIES].entries
     policies = [entries[serial] for serial in kept.serial_K[rows].tolist()]
 
-    statistics = (np.stack([one[name] for one in policies]) for name in ("observation_mean_O", "observation_std_O"))
-    return (PolicyAsk(unvaried([one["centre_D"] for one in policies]), *statistics),)
+    statistics = (
+        np.stack([policy[name] for policy in policies]) for name in ("observation_mean_O", "observation_std_O")
+    )
+    return (PolicyAsk(unvaried([policy["centre_D"] for policy in policies]), *statistics),)
 
 
 def told_of_samples(
@@ -128,7 +130,9 @@ def told_of_samples(
     known = set(kept.serial_K.tolist())
     samples: dict[int, Arrays] | None = None
     if SAMPLES in extra:
-        samples = {serial: one for serial, one in extra[SAMPLES].entries.items() if serial in known}
+        samples = {
+            serial: policy_samples for serial, policy_samples in extra[SAMPLES].entries.items() if serial in known
+        }
     is_valid_R = told.valid_N[again_R]
     kept = _with_new_samples(kept, told, rows_R[is_valid_R], again_R[is_valid_R], samples)
     comes_K = np.zeros(kept.size, bool)
@@ -176,8 +180,8 @@ def _with_new_samples(
             np.append(before["fitness_S"], fitness), np.concatenate([before["descriptor_S_B"], descriptor_B[None]])
         )
     newest = [samples[int(serial)] for serial in kept.serial_K[rows_R]]
-    median_R = np.array([np.median(one["fitness_S"]) for one in newest])
-    median_R_B = np.array([np.median(one["descriptor_S_B"], axis=0) for one in newest])
+    median_R = np.array([np.median(policy_samples["fitness_S"]) for policy_samples in newest])
+    median_R_B = np.array([np.median(policy_samples["descriptor_S_B"], axis=0) for policy_samples in newest])
     return with_values(kept, rows_R, median_R, median_R_B.reshape(descriptor_R_B.shape))
 
 
@@ -222,11 +226,11 @@ def _policies(
     """
     if told.points is None or told.results is None or told.results.trace_T_B is None:
         raise TypeError("elites that are measured again need the evaluations as the loop tells them, with `points`")
-    found = {serial: before[serial] for serial in kept.serial_K.tolist() if serial in known}
+    policies = {serial: before[serial] for serial in kept.serial_K.tolist() if serial in known}
     points = told.points(rows.tolist())
     for serial, row, point in zip(serials.tolist(), rows.tolist(), points, strict=True):
-        found[serial] = read_only(vars(make_elite(point, told.results.trace_T_B[row].copy())))
-    return ByCell(found)
+        policies[serial] = read_only(vars(make_elite(point, told.results.trace_T_B[row].copy())))
+    return ByCell(policies)
 
 
 def _elites(
@@ -267,7 +271,7 @@ def offering(config: RunConfig) -> Callable[[SearchState, Sequence[CentreEvaluat
         state = told_of_samples(config, elites, state, told, new[:, None], rows, again)
         assert before is not None
         assert state.map is not None
-        origins = [None if one.cell == NO_CELL else before.row_of(one.cell) for one in state.centres]
+        origins = [None if centre.cell == NO_CELL else before.row_of(centre.cell) for centre in state.centres]
         cells: list[int | None] = [
             None if row is None else state.map.cell_of(int(before.generation_N[row]), int(before.centre_N[row]))
             for row in origins
@@ -275,7 +279,8 @@ def offering(config: RunConfig) -> Callable[[SearchState, Sequence[CentreEvaluat
         for index in told.centre_N[new].tolist():
             cells[index] = state.map.cell_of(told.generation, index)
         centres = [
-            replace(one, cell=NO_CELL if cell is None else cell) for one, cell in zip(state.centres, cells, strict=True)
+            replace(centre, cell=NO_CELL if cell is None else cell)
+            for centre, cell in zip(state.centres, cells, strict=True)
         ]
         return replace(state, centres=tuple(centres))
 

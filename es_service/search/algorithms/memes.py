@@ -125,7 +125,9 @@ def memes(config: RunConfig) -> Algorithm:
             counts[AGE] = state.extra[AGE] + 1
         return replace(state, extra=read_only({**state.extra, **counts}))
 
-    exploits_M = np.array([weight_of_fitness(emitter_objective(search, one)) > 0.0 for one in range(search.emitters)])
+    exploits_M = np.array(
+        [weight_of_fitness(emitter_objective(search, emitter_index)) > 0.0 for emitter_index in range(search.emitters)]
+    )
     elite_restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
     extra = {STAGNANT: np.zeros(search.emitters, np.int64)}
     if search.exploit_generations is not None:

@@ -76,9 +76,11 @@ def polish(config: RunConfig) -> Algorithm:
         in_round = (generation - 1) % search.round_generations + 1
         remain = search.candidates if generation == 0 else -(-len(evaluations) // 2)
         if len(evaluations) > remain and (generation == 0 or in_round > search.round_generations // 2):
-            index = np.array([one.centre for one in evaluations])
+            index = np.array([evaluation.centre for evaluation in evaluations])
             score = extra[SCORE].copy()
-            score[index] += mean_ranks([one.results for one in evaluations if one.results is not None], search)
+            score[index] += mean_ranks(
+                [evaluation.results for evaluation in evaluations if evaluation.results is not None], search
+            )
             if generation == 0 or in_round == search.round_generations:
                 best = index[np.argsort(-score[index], kind="stable")[:remain]]
                 extra = {**extra, LEFT: np.isin(np.arange(score.size), best), SCORE: np.zeros_like(score)}

@@ -95,7 +95,7 @@ def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int6
     The search relies on the order of the entries: by generation and, within a generation, by centre.
     """
     centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
-    entry_N, elite_N = (one.generation_N * centres + one.centre_N for one in (archive, map_))
+    entry_N, elite_N = (entries.generation_N * centres + entries.centre_N for entries in (archive, map_))
     found_N = np.searchsorted(entry_N, elite_N)
     is_there_N = np.append(entry_N, -1)[found_N] == elite_N
     return np.where(is_there_N, found_N, -1)

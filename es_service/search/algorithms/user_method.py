@@ -33,13 +33,13 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
     if problem := in_no_file(path):
         raise ConfigError(problem)
     try:
-        found = getattr(import_user_module(path), name, None)
+        factory = getattr(import_user_module(path), name, None)
     except Exception as error:  # the user's code can raise anything
         raise ConfigError(why_not_imported(module, error)) from error
-    if not callable(found):
+    if not callable(factory):
         needed = "es_service/search/algorithms/user_method.py describes the function that is needed"
         raise ConfigError(f"{module} has no function {name!r}; {needed}")
-    return found
+    return factory
 
 
 def user_method(path: str) -> Method:
@@ -48,8 +48,8 @@ def user_method(path: str) -> Method:
     Raises:
         ConfigError: the function cannot be imported, or its settings are no class of settings.
     """
-    found = import_factory(path)
-    made = found if isinstance(found, Method) else method(UndeclaredSettings)(found)  # pyright: ignore[reportArgumentType]
+    factory = import_factory(path)
+    made = factory if isinstance(factory, Method) else method(UndeclaredSettings)(factory)  # pyright: ignore[reportArgumentType]
     if not (isinstance(made.settings, type) and issubclass(made.settings, SearchConfig)):
         raise ConfigError(f"{path}: its settings are {made.settings!r}; they must be a class that derives from "
                           "es_service.config.search.SearchConfig or PopulationConfig")  # fmt: skip

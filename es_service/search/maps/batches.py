@@ -30,8 +30,8 @@ def insert_each(
     fittest = np.lexsort((-fitness_Q, cell_Q))  # stable: of equally fit ones the first comes first
     fittest = fittest[np.flatnonzero(np.diff(cell_Q[fittest], prepend=EMPTY))]
     sorted_rows = np.argsort(map_.cell_N)
-    found = np.searchsorted(map_.cell_N, cell_Q[fittest], sorter=sorted_rows)
-    row = np.append(sorted_rows, -1)[found]
+    position = np.searchsorted(map_.cell_N, cell_Q[fittest], sorter=sorted_rows)
+    row = np.append(sorted_rows, -1)[position]
     is_filled = np.append(map_.cell_N, EMPTY)[row] == cell_Q[fittest]
     is_better = is_filled & (fitness_Q[fittest] > np.append(map_.fitness_N, 0.0)[row])
     # A cell was filled by the first one in it, which is not the fittest.

@@ -59,8 +59,8 @@ class BehaviourMap:
 
     def row_of(self, cell: int) -> int | None:
         """Index of a cell on axis N; None if the cell is empty."""
-        found = np.flatnonzero(self.cell_N == cell)
-        return int(found[0]) if found.size else None
+        rows = np.flatnonzero(self.cell_N == cell)
+        return int(rows[0]) if rows.size else None
 
     def cell_of(self, generation: int, centre: int) -> int | None:
         """The cell whose elite is the centre that was evaluated in a generation; None if there is none."""
@@ -144,7 +144,9 @@ def changed(
     """
     row = map_.row_of(cell)
     values = {"fitness_N": fitness, "score_N": score, "samples_N": samples if map_.samples_N is not None else None}
-    return map_ if row is None else _with(map_, row, {name: one for name, one in values.items() if one is not None})
+    return (
+        map_ if row is None else _with(map_, row, {name: value for name, value in values.items() if value is not None})
+    )
 
 
 def removed(map_: BehaviourMap, cell: int) -> BehaviourMap:
@@ -216,8 +218,8 @@ def orders(map_: BehaviourMap) -> NDArray[np.int64]:
 def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bool_]:
     """Whether each entry is the same, bit for bit, as that of its cell in an earlier map, with its order, [N]."""
     was_N, row_N = rows_in(map_, before)
-    now, then = ({**columns_of(one), "order_N": orders(one)} for one in (map_, before))
-    if now.keys() != then.keys():  # one of them counts samples
+    now, then = ({**columns_of(each_map), "order_N": orders(each_map)} for each_map in (map_, before))
+    if now.keys() != then.keys():  # one map counts samples
         return np.zeros(map_.size, bool)
     same_N = was_N.copy()
     for name in now:

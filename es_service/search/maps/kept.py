@@ -121,7 +121,9 @@ def with_values(
     Args:
         rows: indices on axis K, each once.
     """
-    samples_K, fitness_K, descriptor_K_B = (one.copy() for one in (kept.samples_K, kept.fitness_K, kept.descriptor_K_B))
+    samples_K, fitness_K, descriptor_K_B = (
+        column.copy() for column in (kept.samples_K, kept.fitness_K, kept.descriptor_K_B)
+    )
     samples_K[rows] += 1
     fitness_K[rows], descriptor_K_B[rows] = fitness_R, descriptor_R_B
     return replace(kept, samples_K=samples_K, fitness_K=fitness_K, descriptor_K_B=descriptor_K_B)
@@ -135,7 +137,7 @@ def with_means(
 ) -> KeptPolicies:
     """As `with_values`, with the means of all samples, of which the given ones are the newest."""
     count_R, fitness_was_R, descriptor_was_R_B = (
-        one[rows] for one in (kept.samples_K, kept.fitness_K, kept.descriptor_K_B)
+        column[rows] for column in (kept.samples_K, kept.fitness_K, kept.descriptor_K_B)
     )
     return with_values(
         kept,

@@ -21,8 +21,8 @@ from tests.benchmarks.baselines.run import Run
 def begun(task: str, system: str, seed: int, folder: Path) -> Run:
     """A run, new or from its checkpoint."""
     module, _, name = SYSTEMS[system].run.partition(":")
-    found: type[Run] = getattr(importlib.import_module(f"tests.benchmarks.baselines.{module}"), name)
-    return found(task, system, seed, folder)
+    run_class: type[Run] = getattr(importlib.import_module(f"tests.benchmarks.baselines.{module}"), name)
+    return run_class(task, system, seed, folder)
 
 
 def main() -> None:

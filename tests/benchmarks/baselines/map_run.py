@@ -102,9 +102,9 @@ class MapRun(Run):
         else:
             asked, extra = self._ask(self._repertoire, self._emitter, first)
         result = self._evaluate(flat(asked["params"]), generation=self._generation)
-        found = result.transitions
-        assert found is not None
-        scores = {"transitions": transitions_of(found, BATCH * self._episode_steps)}
+        transitions = result.transitions
+        assert transitions is not None
+        scores = {"transitions": transitions_of(transitions, BATCH * self._episode_steps)}
         fitness_N, descriptor_N = result.fitness[:, 0], result.descriptor[:, 0]
         if self._repertoire is None:
             self._repertoire, self._emitter, _ = self._search.init_ask_tell(
@@ -132,7 +132,7 @@ class MapRun(Run):
         """The best of the fittest elites; the map has -inf where there is none."""
         self._evaluating.__exit__(None, None, None)
         fitness = np.asarray(self._repertoire.fitnesses).reshape(-1)
-        fittest = [one for one in np.argsort(-fitness, kind="stable")[:TOP] if np.isfinite(fitness[one])]
+        fittest = [cell for cell in np.argsort(-fitness, kind="stable")[:TOP] if np.isfinite(fitness[cell])]
         elites = jax.tree.map(lambda array: np.asarray(array)[fittest], self._repertoire.genotypes["params"])
         return chosen_and_certified(flat(elites), self._config, episodes)
 

@@ -50,5 +50,5 @@ class OurRun(Run):
 
     def certified(self, episodes: int) -> Found:
         """The best of the best centre, or of the ten elites with the highest fitness."""
-        [one] = certify_run(self._folder, episodes=episodes, workers=1)
-        return Found(one.episodes, one.candidates)
+        [policy] = certify_run(self._folder, episodes=episodes, workers=1)
+        return Found(policy.episodes, policy.candidates)

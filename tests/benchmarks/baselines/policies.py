@@ -26,13 +26,13 @@ def of_skills(layers: Mapping[str, Any], skills: int, actions: int) -> FloatArra
     kernel, bias = every[0]
     every[0] = [kernel[:-skills], bias + kernel[-skills:]]
     every[-1] = [part[..., :actions] for part in every[-1]]
-    found = {}
+    layers_of_skills = {}
     for number, (kernel, bias) in enumerate(every):
-        found[f"layer_{number}"] = {
+        layers_of_skills[f"layer_{number}"] = {
             "kernel": np.broadcast_to(kernel, (skills, *kernel.shape)),
             "bias": np.broadcast_to(bias, (skills, bias.shape[-1])),
         }
-    return flat(found)
+    return flat(layers_of_skills)
 
 
 def _in_order(layers: Mapping[str, Any]) -> list[Any]:

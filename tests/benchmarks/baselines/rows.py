@@ -31,8 +31,8 @@ def read(table: Path) -> list[dict[str, Any]]:
     """The rows of a table; none if there is none yet."""
     if not table.exists():
         return []
-    found = pd.read_csv(table, dtype={"seed": int})
-    return [{str(name): value for name, value in row.items()} for row in found.to_dict("records")]
+    frame = pd.read_csv(table, dtype={"seed": int})
+    return [{str(name): value for name, value in row.items()} for row in frame.to_dict("records")]
 
 
 def put(table: Path, row: Mapping[str, Any]) -> None:
@@ -43,8 +43,8 @@ def put(table: Path, row: Mapping[str, Any]) -> None:
     """
     if {*row} != {*COLUMNS}:
         raise ValueError(f"a row has the columns {', '.join(COLUMNS)}, but this one has {', '.join(row)}")
-    others = [one for one in read(table) if any(one[name] != row[name] for name in KEY)]
-    rows = sorted([*others, dict(row)], key=lambda one: [one[name] for name in KEY])
+    others = [entry for entry in read(table) if any(entry[name] != row[name] for name in KEY)]
+    rows = sorted([*others, dict(row)], key=lambda entry: [entry[name] for name in KEY])
     new = table.with_suffix(".new")
     pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(new, index=False, float_format="%.6g", lineterminator="\n")
     os.replace(new, table)
@@ -57,10 +57,10 @@ def in_words(rows: Sequence[Mapping[str, Any]]) -> str:
     for number, task in enumerate(TASKS):
         runs = [row for row in rows if row["task"] == task]
         lines = [f"**{task}**", "", "| " + " | ".join(HEADINGS) + " |", "| --- " * len(HEADINGS) + "|"]
-        for system, one in SYSTEMS.items():
+        for system, program in SYSTEMS.items():
             if of_system := [row for row in runs if row["system"] == system]:
-                paper = PAPER.get(one.name, ("",) * len(TASKS))[number]
-                lines.append("| " + " | ".join([one.name, *_cells(of_system), paper]) + " |")
+                paper = PAPER.get(program.name, ("",) * len(TASKS))[number]
+                lines.append("| " + " | ".join([program.name, *_cells(of_system), paper]) + " |")
         if runs:
             tables.append("\n".join(lines))
     return "\n\n".join(tables)

@@ -89,7 +89,7 @@ def cpu_seconds() -> float:
             fields = stat.read_text().rpartition(")")[2].split()
             if int(fields[1]) == os.getpid():
                 ticks += sum(map(int, fields[11:15]))  # its own, and of its children that have ended
-    return sum(one.ru_utime + one.ru_stime for one in used) + ticks / os.sysconf("SC_CLK_TCK")
+    return sum(usage.ru_utime + usage.ru_stime for usage in used) + ticks / os.sysconf("SC_CLK_TCK")
 
 
 class Run(ABC):
@@ -163,8 +163,8 @@ class Run(ABC):
     def row(self, *, is_finished: bool, episodes: int = EPISODES) -> dict[str, Any]:
         """The run's row, with the certified value of what it has found."""
         steps, seconds = self.steps, self.cpu_seconds
-        found = self.certified(episodes)
-        values = found.episodes.values()
+        certified = self.certified(episodes)
+        values = certified.episodes.values()
         successes = values["successes"]
         names = [f"{what}_{part}" for what in ("return", "goal_distance") for part in ("mean", "low", "high")]
         return {
@@ -178,7 +178,7 @@ class Run(ABC):
             "success": None if successes is None else successes / episodes,
             **{name: values[name] for name in ("success_low", "success_high")},
             "episodes": episodes,
-            "candidates": found.candidates,
+            "candidates": certified.candidates,
             "updates_per_step": self.facts.updates_per_step,
             "network": "x".join(map(str, self.facts.network)) or "linear",
             "settings": self.facts.settings,
@@ -208,5 +208,5 @@ def relu_config(task: str, seed: int) -> dict[str, Any]:
 
 def chosen_and_certified(parameters_N_D: ArrayLike, config: Mapping[str, Any], episodes: int) -> Found:
     """The best of N policies by selection episodes, in certification episodes."""
-    [one] = es_service.certify(parameters_N_D, config, episodes=episodes)
-    return Found(one.episodes, one.candidates)
+    [policy] = es_service.certify(parameters_N_D, config, episodes=episodes)
+    return Found(policy.episodes, policy.candidates)

@@ -83,7 +83,7 @@ class Distillation(VecEnvWrapper):
 
         @jax.jit
         def learnt(predictor: Any, state: Any, x_N_O: Any) -> tuple[Any, Any]:
-            changes, state = optimiser.update(jax.grad(lambda one: errors(one, x_N_O).mean())(predictor), state)
+            changes, state = optimiser.update(jax.grad(lambda weights: errors(weights, x_N_O).mean())(predictor), state)
             return optax.apply_updates(predictor, changes), state
 
         self._error_of, self._learnt = errors, learnt
@@ -123,8 +123,8 @@ def _network(key: Any, size: int) -> list[tuple[Any, Any]]:
     widths = (size, Distillation.HIDDEN, Distillation.HIDDEN, Distillation.FEATURES)
     keys = jax.random.split(key, len(widths) - 1)
     return [
-        (jax.random.normal(one, (before, after)) * np.sqrt(2.0 / before), jnp.zeros(after))
-        for one, before, after in zip(keys, widths[:-1], widths[1:], strict=True)
+        (jax.random.normal(layer_key, (before, after)) * np.sqrt(2.0 / before), jnp.zeros(after))
+        for layer_key, before, after in zip(keys, widths[:-1], widths[1:], strict=True)
     ]
 
 

@@ -69,9 +69,9 @@ def assembled(folder: Path, name: str, text: str, registers: int | None = None) 
     source.write_text(text)
     limit = [f"-maxrregcount={registers}"] if registers else []
     command = ["ptxas", "-v", f"-arch={ARCHITECTURE}", *limit, str(source), "-o", str(folder / f"{name}.cubin")]
-    found = reported(command, f"ptxas refuses {source}")
+    report = reported(command, f"ptxas refuses {source}")
     source.unlink()
-    return found
+    return report
 
 
 def reported(command: list[str], refused: str) -> dict:
@@ -111,7 +111,7 @@ def physics_files(folder: Path, task: str) -> None:
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(physics.step)(physics.carry, physics.action))
     given = np.concatenate([rows(first), rows([actions[0]])])[:, :8]
     wanted = np.stack(
-        [np.asarray(one).view(np.uint32) for one in evaluate(graph, outputs, np.ascontiguousarray(given))]
+        [np.asarray(result).view(np.uint32) for result in evaluate(graph, outputs, np.ascontiguousarray(given))]
     )
     assert on_device.differing(kept[1][:, :8], wanted) == 0, "the kernel of this processor differs from its definition"
     np.savez_compressed(
@@ -206,12 +206,14 @@ def operation_files(folder: Path) -> None:
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(operations)(*FIVE))
     given = operation_arguments()
     with np.errstate(invalid="ignore"):
-        found = [np.asarray(one) for one in evaluate(graph, outputs, given)]
+        results = [np.asarray(result) for result in evaluate(graph, outputs, given)]
     np.savez_compressed(
         folder / "operations.npz",
         given=given,
-        floats=np.array([one.dtype == np.float32 for one in found]),
-        wanted=np.stack([one.astype(np.uint32) if one.dtype == bool else one.view(np.uint32) for one in found]),
+        floats=np.array([result.dtype == np.float32 for result in results]),
+        wanted=np.stack(
+            [result.astype(np.uint32) if result.dtype == bool else result.view(np.uint32) for result in results]
+        ),
     )
 
 
@@ -229,11 +231,11 @@ ld.param.u64 %d0, [found]; ld.param.u64 %d1, [trips];
 mov.u32 %r0, %tid.x; mov.u32 %r1, %ctaid.x; mov.u32 %r2, %ntid.x; mad.lo.s32 %r3, %r1, %r2, %r0;
 mul.wide.u32 %d2, %r3, 4; add.s64 %d0, %d0, %d2;
 mov.f32 %f8, 0f3F7FFFFE; cvt.rn.f32.s32 %f9, %r3;
-{" ".join(f"mov.f32 {one}, %f9;" for one in registers)}
+{" ".join(f"mov.f32 {register}, %f9;" for register in registers)}
 again:
 {body}
 add.s64 %d1, %d1, -1; setp.gt.s64 %p, %d1, 0; @%p bra again;
-{" ".join(f"add.f32 %f0, %f0, {one};" for one in registers[1:])}
+{" ".join(f"add.f32 %f0, %f0, {register};" for register in registers[1:])}
 st.global.f32 [%d0], %f0; ret;
 }}
 """

@@ -115,7 +115,7 @@ def measure(case: dict[str, Any], out: Path, lock: Path) -> dict[str, Any]:
     with lock.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         timed = [_timed(compiled, given) for _ in range(3)]
-    episodes, seconds, digests = timed[-1][1], [one[0] for one in timed], [digest(one[1]) for one in timed]
+    episodes, seconds, digests = timed[-1][1], [timing[0] for timing in timed], [digest(timing[1]) for timing in timed]
     steps = int(episodes.steps.sum())
     stats = jax.devices()[0].memory_stats() or {}
     if case.get("keep_returns"):

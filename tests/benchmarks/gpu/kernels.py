@@ -139,9 +139,9 @@ def policy_layout(spec: PolicySpec, inputs_O: np.ndarray) -> PolicyLayout:
         noise.append(biases)
         centre += [weights, biases]
         start, rows = start + (inputs + 1) * outputs, np.arange(outputs)
-    bytes_ = np.concatenate([one.reshape(-1) for one in noise])
+    bytes_ = np.concatenate([indices.reshape(-1) for indices in noise])
     bytes_ = np.concatenate([bytes_, np.zeros(-len(bytes_) % 128, bytes_.dtype)])
-    return PolicyLayout(bytes_.astype(np.uint32), np.concatenate([one.reshape(-1) for one in centre]))
+    return PolicyLayout(bytes_.astype(np.uint32), np.concatenate([indices.reshape(-1) for indices in centre]))
 
 
 def operations(a: Any, b: Any, c: Any, i: Any, j: Any) -> tuple[Any, ...]:
@@ -165,7 +165,9 @@ FIVE = (*[jax.ShapeDtypeStruct((), jnp.float32)] * 3, *[jax.ShapeDtypeStruct((),
 
 def operation_functions(target: Target, *, quick: bool = False) -> list[FunctionBuilder]:
     """Functions of the kernel `operations(given [5, lane], found [word, lane], lanes, 1)`."""
-    functions = function_of("compute", operations, [("given", one) for one in FIVE], "found", target, quick=quick)
+    functions = function_of(
+        "compute", operations, [("given", argument) for argument in FIVE], "found", target, quick=quick
+    )
     pointers = [Pointer("given"), Pointer("found")]
     return [*functions, lane_function("operations", pointers, [Call(functions[-1], ("given", "found"))], target)]
 

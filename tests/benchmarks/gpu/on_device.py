@@ -82,8 +82,8 @@ class Results:
         self.file = (Path(os.environ.get("OUT", ".")) / "ptx.jsonl").open("a")
         self.started = time.monotonic()
 
-    def __call__(self, part: str, **found: Any) -> None:
-        line = json.dumps({"part": part, **found, "at_s": round(time.monotonic() - self.started, 2)})
+    def __call__(self, part: str, **fields: Any) -> None:
+        line = json.dumps({"part": part, **fields, "at_s": round(time.monotonic() - self.started, 2)})
         print(line, flush=True)
         self.file.write(line + "\n")
         self.file.flush()
@@ -114,30 +114,30 @@ class Kernels:
 def seconds_of(cupy: Any, work: Callable[..., object], *given: Any, repeats: int = REPEATS) -> list[float]:
     """Seconds of each of some runs of `work(*given)` on the GPU, after one that does not count."""
     work(*given)
-    found = []
+    durations = []
     for _ in range(repeats):
         start, end = cupy.cuda.Event(), cupy.cuda.Event()
         start.record()
         work(*given)
         end.record()
         end.synchronize()
-        found.append(cupy.cuda.get_elapsed_time(start, end) / 1000)
-    return found
+        durations.append(cupy.cuda.get_elapsed_time(start, end) / 1000)
+    return durations
 
 
 def compare_operations(cupy: Any, say: Results) -> None:
     """Compare every operation with its definition."""
     file = np.load(HERE / "operations.npz")
     given, wanted, floats = file["given"], file["wanted"], file["floats"]
-    found = cupy.asarray(np.full(wanted.shape, 0xAAAAAAAA, np.uint32))
-    Kernels(cupy, "operations")("operations", [cupy.asarray(given), found], given.shape[1])
-    found = cupy.asnumpy(found)
+    results = cupy.asarray(np.full(wanted.shape, 0xAAAAAAAA, np.uint32))
+    Kernels(cupy, "operations")("operations", [cupy.asarray(given), results], given.shape[1])
+    results = cupy.asnumpy(results)
     wrong = {}
-    for number, (one, other, is_float) in enumerate(zip(found, wanted, floats, strict=True)):
-        bad = without_nans(one) != without_nans(other) if is_float else one != other
+    for number, (result, other, is_float) in enumerate(zip(results, wanted, floats, strict=True)):
+        bad = without_nans(result) != without_nans(other) if is_float else result != other
         if bad.any():
             lane = int(np.argmax(bad))
-            words = [hex(word) for word in (*given[:, lane], one[lane], other[lane])]
+            words = [hex(word) for word in (*given[:, lane], result[lane], other[lane])]
             wrong[number] = {"count": int(bad.sum()), "first": words}
     say("operations", results=len(wanted), lanes=given.shape[1], words_wrong=sum(x["count"] for x in wrong.values()),
         wrong=wrong)  # fmt: skip
@@ -158,11 +158,11 @@ def compare_division(cupy: Any, say: Results, lanes: int = 1 << 22) -> None:
             a, b, c = (np.where(np.abs(x) < 2.0**-126, x * 0, x).astype(np.float64) for x in given)
             exact = np.stack([a / b, np.sqrt(c)])
             wanted = np.where(np.abs(exact) < 2.0**-126 - 2.0**-151, exact * 0, exact).astype(np.float32)
-        found = cupy.empty((2, lanes), np.uint32)
-        kernels("division", [cupy.asarray(bits), found], lanes, block=128)
-        found = cupy.asnumpy(found)
-        wrong = without_nans(found) != without_nans(wanted.view(np.uint32))
-        first = [hex(word) for word in (*bits[:, lane], *found[:, lane])] if wrong.any() and (
+        results = cupy.empty((2, lanes), np.uint32)
+        kernels("division", [cupy.asarray(bits), results], lanes, block=128)
+        results = cupy.asnumpy(results)
+        wrong = without_nans(results) != without_nans(wanted.view(np.uint32))
+        first = [hex(word) for word in (*bits[:, lane], *results[:, lane])] if wrong.any() and (
             lane := int(np.argmax(wrong.any(axis=0)))) >= 0 else None  # fmt: skip
         say("division", what=what, lanes=lanes, quotients_wrong=int(wrong[0].sum()), roots_wrong=int(wrong[1].sum()),
             first=first)  # fmt: skip
@@ -182,10 +182,10 @@ def compare_physics(cupy: Any, say: Results, task: str, variant: str) -> None:
     for number in range(steps + 1):
         if number:
             kernels("physics", [states, actions[number - 1]], lanes)
-        found = cupy.asnumpy(states)
-        wrong_lanes.append(int(np.count_nonzero(digest(found) != digests[number])))
+        words = cupy.asnumpy(states)
+        wrong_lanes.append(int(np.count_nonzero(digest(words) != digests[number])))
         if number in kept:
-            wrong_words[number] = differing(found, kept[number])
+            wrong_words[number] = differing(words, kept[number])
     first = next((number for number, count in enumerate(wrong_lanes) if count), None)
     kernels("begin", [keys, states], lanes)
     kernels("physics", [states, actions], lanes, steps, block=64)
@@ -224,8 +224,8 @@ class Rollout:
         coordinates = file["coordinates"]
         self.stream = cupy.cuda.Stream(non_blocking=True)
         self.centre, self.constants, self.coordinates, self.noise_keys, self.reset_keys, self.action_keys = (
-            cupy.asarray(np.ascontiguousarray(one))
-            for one in (file["centre"], file["constants"], coordinates, noise_keys, reset_keys, action_keys)
+            cupy.asarray(np.ascontiguousarray(array))
+            for array in (file["centre"], file["constants"], coordinates, noise_keys, reset_keys, action_keys)
         )
         self.noise = cupy.empty((self.pairs, len(coordinates)), np.uint8)
         words, inputs, outputs = len(file["carries"][0]), len(file["seen"]), len(file["actions"])
@@ -296,12 +296,12 @@ def rollout_wrong(file: Any, words: np.ndarray, number: int) -> dict[str, int]:
     episode's result goes on in each kernel in its own way, and is not compared."""
     wanted = file["carries"][file["numbers"].tolist().index(number)]
     alive = wanted[int(file["alive_word"])] != 0
-    found, wanted, alive = (one[..., : words.shape[1]][..., : wanted.shape[1]] for one in (words, wanted, alive))
+    compared, wanted, alive = (array[..., : words.shape[1]][..., : wanted.shape[1]] for array in (words, wanted, alive))
     result = slice(len(wanted) - int(file["episode_words"]), None)
     return {
         "alive": int(alive.sum()),
-        "words_wrong": differing(found[:, alive], wanted[:, alive]),
-        "result_words_wrong": differing(found[result], wanted[result]),
+        "words_wrong": differing(compared[:, alive], wanted[:, alive]),
+        "result_words_wrong": differing(compared[result], wanted[result]),
     }
 
 
@@ -309,25 +309,25 @@ def compare_rollouts(cupy: Any, say: Results, task: str, variant: str) -> None:
     """Compare noise, observations, outputs of each kernel of policies, and whole episodes with the processor's."""
     file = np.load(HERE / f"{task}_rollout.npz")
     members = file["reset_keys"].shape[1]
-    one = Rollout(cupy, task, file, rollout_keys(file, members), variant)
-    one.start()
-    one.stream.synchronize()
+    rollout = Rollout(cupy, task, file, rollout_keys(file, members), variant)
+    rollout.start()
+    rollout.stream.synchronize()
     used = file["coordinates"] != 0
-    noise = cupy.asnumpy(one.noise)[: len(file["noise"])]
+    noise = cupy.asnumpy(rollout.noise)[: len(file["noise"])]
     say("rollout_bits", task=task, what="noise", bytes_wrong=int((noise != file["noise"])[:, used].sum()))
-    say("rollout_bits", task=task, what="reset", **rollout_wrong(file, one.words(), 0))
-    seen = differing(cupy.asnumpy(one.seen), file["seen"])
+    say("rollout_bits", task=task, what="reset", **rollout_wrong(file, rollout.words(), 0))
+    seen = differing(cupy.asnumpy(rollout.seen), file["seen"])
     say("rollout_bits", task=task, what="seen", words_wrong=seen, words=file["seen"].size)
     for policy in POLICIES:
-        one.policy = policy
-        with one.stream:
-            one.decide()
-        one.stream.synchronize()
-        wrong = differing(cupy.asnumpy(one.actions), file["actions"])
+        rollout.policy = policy
+        with rollout.stream:
+            rollout.decide()
+        rollout.stream.synchronize()
+        wrong = differing(cupy.asnumpy(rollout.actions), file["actions"])
         say("rollout_bits", task=task, what=policy, words_wrong=wrong, words=file["actions"].size)
-    one.policy, done = "policy_2_2", 0
+    rollout.policy, done = "policy_2_2", 0
     for number in file["numbers"].tolist():
-        one.run(number - done)
+        rollout.run(number - done)
         done = number
         say(
             "rollout_bits",
@@ -335,7 +335,7 @@ def compare_rollouts(cupy: Any, say: Results, task: str, variant: str) -> None:
             variant=variant,
             what="episodes",
             steps=number,
-            **rollout_wrong(file, one.words(), number),
+            **rollout_wrong(file, rollout.words(), number),
         )
 
 
@@ -343,23 +343,23 @@ def time_rollouts(cupy: Any, say: Results, task: str, members: int, steps: int) 
     """Time whole control steps of members: each kernel alone, then the fastest together, in one stream or several."""
     file = np.load(HERE / f"{task}_rollout.npz")
     keys = rollout_keys(file, members)
-    one = Rollout(cupy, task, file, keys)
-    one.start()
+    rollout = Rollout(cupy, task, file, keys)
+    rollout.start()
     alone: dict[tuple, float] = {}
-    with one.stream:
+    with rollout.stream:
         for policy in POLICIES:
-            one.policy = policy
-            alone[policy,] = min(seconds_of(cupy, one.decide, 10)) / 10
-        best_policy = one.policy = min(POLICIES, key=lambda policy: alone[policy,])
+            rollout.policy = policy
+            alone[policy,] = min(seconds_of(cupy, rollout.decide, 10)) / 10
+        best_policy = rollout.policy = min(POLICIES, key=lambda policy: alone[policy,])
         for variant in VARIANTS:
-            one.episodes = Kernels(cupy, f"{task}_episodes_{variant}")
+            rollout.episodes = Kernels(cupy, f"{task}_episodes_{variant}")
             for block in (32, 64, 128):
-                one.block = block
-                alone[variant, block] = min(seconds_of(cupy, one.advance, 10)) / 10
+                rollout.block = block
+                alone[variant, block] = min(seconds_of(cupy, rollout.advance, 10)) / 10
     variant, block = min((key for key in alone if len(key) == 2), key=alone.__getitem__)
     say("rollout_parts", task=task, members=members, us={"/".join(map(str, key)): round(1e6 * x, 1)
         for key, x in alone.items()}, best=[best_policy, variant, block])  # fmt: skip
-    del one
+    del rollout
     for streams in (1, 2, 4):
         parts = [
             Rollout(cupy, task, file, part, variant)
@@ -392,24 +392,24 @@ def timed_rollouts(cupy: Any, parts: list[Rollout], steps: int) -> dict[str, Any
         cupy.cuda.runtime.deviceSynchronize()
         return round(members * (steps // chunk) * chunk / (time.perf_counter() - started))
 
-    found: dict[str, Any] = {"by_launches": rate(lambda number: parts[number].run(chunk))}
+    rates: dict[str, Any] = {"by_launches": rate(lambda number: parts[number].run(chunk))}
     try:
         graphs = [part.graph(chunk) for part in parts]
-        found["by_graphs"] = rate(lambda number: graphs[number].launch(parts[number].stream))
+        rates["by_graphs"] = rate(lambda number: graphs[number].launch(parts[number].stream))
     except Exception as error:  # what was launched one by one counts as well
-        found["by_graphs"] = repr(error)
-    return found
+        rates["by_graphs"] = repr(error)
+    return rates
 
 
 def time_code(cupy: Any, say: Results) -> None:
     """Time straight loops of products and sums by the size of their code, with 1 to 16 warps on a multiprocessor."""
     count = cupy.cuda.runtime.getDeviceProperties(0)["multiProcessorCount"]
-    found = cupy.empty((count * 512,), np.float32)
+    results = cupy.empty((count * 512,), np.float32)
     for kib in CODE_KIB:
         kernels, trips = Kernels(cupy, f"code_{kib}"), 5120 // kib
         ns = {}
         for warps in (1, 2, 4, 8, 16):
-            runs = seconds_of(cupy, kernels, "code", [found], count * 32 * warps, trips, 32 * warps)
+            runs = seconds_of(cupy, kernels, "code", [results], count * 32 * warps, trips, 32 * warps)
             ns[warps] = round(min(runs) * 1e9 / (trips * kib * 64), 3)
         say("code_speed", kib=kib, ns_of_an_instruction_by_warps=ns)
 
@@ -417,10 +417,10 @@ def time_code(cupy: Any, say: Results) -> None:
 def profile(cupy: Any, task: str = "ant_maze", members: int = 8192) -> None:
     """A few control steps, for a profiler."""
     file = np.load(HERE / f"{task}_rollout.npz")
-    one = Rollout(cupy, task, file, rollout_keys(file, members), "quick_255")
-    one.start()
-    one.run(4)
-    one.stream.synchronize()
+    rollout = Rollout(cupy, task, file, rollout_keys(file, members), "quick_255")
+    rollout.start()
+    rollout.run(4)
+    rollout.stream.synchronize()
 
 
 def main() -> None:

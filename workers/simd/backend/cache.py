@@ -31,13 +31,13 @@ def cache_folder() -> Path | None:
 def why_not_trusted(folder: Path) -> str:
     """Why code from a folder must not be executed; empty if it may be, or if there is no such folder yet."""
     try:
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return ""
-    if found.st_uid != os.geteuid():
-        return f"it belongs to user {found.st_uid}, not to this user ({os.geteuid()})"
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return f"other users may write into it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it"
+    if status.st_uid != os.geteuid():
+        return f"it belongs to user {status.st_uid}, not to this user ({os.geteuid()})"
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"other users may write into it (mode {stat.S_IMODE(status.st_mode):o}); chmod 700 it"
     return ""
 
 
@@ -91,10 +91,10 @@ def save(folder: Path, key: str, code: bytes) -> None:
 
 def _prune(folder: Path) -> None:
     """Remove the least recently used of the cache's own files, including unfinished files of killed processes."""
-    found = []
+    files = []
     for path in folder.iterdir():
         if len(path.name) == KEY_LENGTH or path.name.startswith(UNFINISHED):
             with contextlib.suppress(OSError):  # another process may be pruning at the same time
-                found.append((path.stat().st_mtime, path))
-    for _, path in sorted(found)[:-MOST_ENTRIES]:
+                files.append((path.stat().st_mtime, path))
+    for _, path in sorted(files)[:-MOST_ENTRIES]:
         path.unlink(missing_ok=True)

@@ -33,13 +33,13 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, target: Target) -> s
     block = graph_function("block", graph, outputs, [("in", inputs)], "out", target)
     inside = FunctionBuilder("inside", ["ptr noalias %in", "ptr noalias %out", "i64 %blocks"], target)
 
-    def one(number: str, _: list[str]) -> list[str]:
+    def compute_block(number: str, _: list[str]) -> list[str]:
         block_in = inside.at("%in", inside.index((number, inputs)), inside.llvm_types["i"])
         block_out = inside.at("%out", inside.index((number, len(outputs))), inside.llvm_types["i"])
         inside.do(f"call void @block(ptr {block_in}, ptr {block_out})")
         return []
 
-    inside.loop("%blocks", one)
+    inside.loop("%blocks", compute_block)
     return module([block, inside])
 
 
@@ -62,7 +62,7 @@ def graph_function(
             words are read before any is written.
         apart: pointers whose words are not neighbours but `%lanes` words apart, as in [word, lane]. If there are any,
             `i64 %lanes` is the function's last parameter.
-        writes: what writes the instructions; `Writer` if None.
+        writes: class of the writer; `Writer` if None.
 
     Raises:
         UnsupportedError: more values are needed at the same time, or carried by loops, than fit on the stack.

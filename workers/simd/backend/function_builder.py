@@ -162,8 +162,8 @@ class FunctionBuilder:
     def any(self, words: str, lanes: int | None = None) -> str:
         """An i1 that is true if any word of an integer vector is not 0."""
         llvm_type = f"<{lanes or self.width} x i32>"
-        found = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (llvm_type, words))
-        return self.value(f"icmp ne i32 {found}, 0")
+        combined = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (llvm_type, words))
+        return self.value(f"icmp ne i32 {combined}, 0")
 
     def when(self, condition: str, body: Callable[[], object]) -> None:
         """Run the instructions that `body` adds only if an i1 is true."""

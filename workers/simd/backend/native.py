@@ -34,11 +34,11 @@ class Native(NamedTuple):
     def function(self, *arguments: Any) -> Callable[..., None]:
         """The function `kernel` for arguments of these ctypes, where arrays stand for pointers to their data; the code
         lives as long as it does."""
-        found = ctypes.CFUNCTYPE(None, *arguments)(self.address)
+        kernel = ctypes.CFUNCTYPE(None, *arguments)(self.address)
 
         def call(*given: Any) -> None:
             assert self.alive
-            found(*[one.ctypes.data if isinstance(one, np.ndarray) else one for one in given])
+            kernel(*[argument.ctypes.data if isinstance(argument, np.ndarray) else argument for argument in given])
 
         return call
 

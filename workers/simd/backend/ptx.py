@@ -65,19 +65,23 @@ def lane_function(name: str, pointers: Sequence[Pointer], calls: Sequence[Call],
 
     Each step makes the calls in their order.
     """
-    parameters = [f"ptr {'noalias ' * (len(pointers) > 0)}%{one.name}" for one in pointers]
+    parameters = [f"ptr {'noalias ' * (len(pointers) > 0)}%{pointer.name}" for pointer in pointers]
     builder = FunctionBuilder(f"{name}_of_lane", [*parameters, "i64 %lanes", "i64 %steps", "i64 %lane"], target)
-    first = {one.name: builder.at(f"%{one.name}", "%lane", "i32") for one in pointers if one.by_lane}
+    first = {pointer.name: builder.at(f"%{pointer.name}", "%lane", "i32") for pointer in pointers if pointer.by_lane}
 
     def step(number: str, _: Values) -> Values:
-        places = {one.name: first.get(one.name, f"%{one.name}") for one in pointers}
-        for one in pointers:
-            if one.words_of_step:
-                words = builder.value(f"mul i64 {number}, {one.words_of_step}")
-                places[one.name] = builder.at(places[one.name], builder.value(f"mul i64 {words}, %lanes"), "i32")
+        places = {pointer.name: first.get(pointer.name, f"%{pointer.name}") for pointer in pointers}
+        for pointer in pointers:
+            if pointer.words_of_step:
+                words = builder.value(f"mul i64 {number}, {pointer.words_of_step}")
+                places[pointer.name] = builder.at(
+                    places[pointer.name], builder.value(f"mul i64 {words}, %lanes"), "i32"
+                )
         for call in calls:
-            builder.do(f"call void @{call.function.name}({', '.join(f'ptr {places[one]}' for one in call.pointers)}"
-                       ", i64 %lanes)")  # fmt: skip
+            builder.do(
+                f"call void @{call.function.name}("
+                f"{', '.join(f'ptr {places[pointer_name]}' for pointer_name in call.pointers)}, i64 %lanes)"
+            )
         return []
 
     builder.loop("%steps", step)
@@ -88,14 +92,16 @@ def ptx(functions: Sequence[FunctionBuilder]) -> str:
     """PTX of one kernel for each of the `lane_function` among functions, with its name and parameters but the lane."""
     target = functions[0].target
     kernels = []
-    for one in functions:
-        name = one.name.removesuffix("_of_lane")
-        if name != one.name:
-            kernels.append(KERNEL.format(name=name, parameters=", ".join(one.parameters[:-1]).replace(" noalias", "")))
-    called = sorted(set().union(*(one.declarations for one in functions)))
+    for function in functions:
+        name = function.name.removesuffix("_of_lane")
+        if name != function.name:
+            kernels.append(
+                KERNEL.format(name=name, parameters=", ".join(function.parameters[:-1]).replace(" noalias", ""))
+            )
+    called = sorted(set().union(*(function.declarations for function in functions)))
     text = "\n".join(
         [
-            *(one.text("alwaysinline") for one in functions),
+            *(function.text("alwaysinline") for function in functions),
             *kernels,
             *(f"declare i32 @llvm.nvvm.read.ptx.sreg.{name}.x()" for name in READ),
             *called,

@@ -63,10 +63,10 @@ class QuickWriter(Writer):
     def trip(self, region: Region) -> list[tuple[str, str]]:
         """Write the body of a loop; returns (LLVM type, name) of what each carry becomes."""
         before, self.noted = self.noted, self.nothing()
-        found = super().trip(region)
+        ends = super().trip(region)
         self.flush()
         self.noted = before
-        return found
+        return ends
 
     def finish(self, write: Callable[[], object]) -> None:
         """Write what follows the computation: its results, or the call of the exact function."""
@@ -125,8 +125,8 @@ class QuickWriter(Writer):
         if not intrinsics:
             return super().operation("div", [one, x if name == "div" else super().operation("sqrt", [x])])
         element = builder.value(f"extractelement {floats} {x}, i64 0")
-        found = builder.call("float", intrinsics[name == "sqrt"], ("float", element))
-        return builder.value(f"insertelement {floats} poison, float {found}, i64 0")
+        estimate = builder.call("float", intrinsics[name == "sqrt"], ("float", element))
+        return builder.value(f"insertelement {floats} poison, float {estimate}, i64 0")
 
     def extreme(self, which: str, a: str, b: str) -> str:
         """The greater or the smaller of two floats; NaN is neither."""
@@ -138,7 +138,7 @@ class QuickWriter(Writer):
         return self.constant("f", struct.unpack("<i", struct.pack("<f", value))[0])
 
     def nothing(self) -> Noted:
-        """What is noted of code without quotients and roots."""
+        """Notes of code without quotients and roots."""
         return Noted(self.number(0.0), self.number(0.0), self.number(float("inf")), "splat (i32 -1)")
 
     def flush(self) -> None:

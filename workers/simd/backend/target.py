@@ -163,7 +163,11 @@ def host_target(isa: str | None = None) -> Target:
     """
     triple, cpu, features = _host()
     machine = triple.partition("-")[0]
-    of_machine = {name: one for name, one in ISAS.items() if one.architecture == ARCHITECTURES.get(machine)}
+    of_machine = {
+        name: instruction_set
+        for name, instruction_set in ISAS.items()
+        if instruction_set.architecture == ARCHITECTURES.get(machine)
+    }
     if not of_machine:
         known = ", ".join(dict.fromkeys(ARCHITECTURES.values()))
         raise NoVectorsError(f"simd has no code for the architecture {machine}, only for {known}")
@@ -171,11 +175,11 @@ def host_target(isa: str | None = None) -> Target:
         raise NoVectorsError(f"{ISAS[isa].title} was requested, which {machine} does not have")
     lacks: list[str] = []
     for name in [isa] if isa else of_machine:
-        lacks = [one for one in ISAS[name].needs if not features.get(one)]
+        lacks = [feature for feature in ISAS[name].needs if not features.get(feature)]
         if not lacks:
-            wanted = {one: on and not one.startswith(ISAS[name].hides) for one, on in features.items()}
+            wanted = {feature: on and not feature.startswith(ISAS[name].hides) for feature, on in features.items()}
             return Target(
-                name, triple, cpu, ",".join(f"{'+' if on else '-'}{one}" for one, on in sorted(wanted.items()))
+                name, triple, cpu, ",".join(f"{'+' if on else '-'}{feature}" for feature, on in sorted(wanted.items()))
             )
     if isa:
         raise NoVectorsError(
@@ -189,6 +193,6 @@ def host_target(isa: str | None = None) -> Target:
 
 def target_of(isa: str) -> Target:
     """Target of any processor with an instruction set, for code that this machine need not be able to run."""
-    found = ISAS[isa]
-    features = ",".join(f"+{name}" for name in found.needs)
-    return Target(isa, PROCESSORS[found.architecture].triple, found.cpu, features)
+    instruction_set = ISAS[isa]
+    features = ",".join(f"+{name}" for name in instruction_set.needs)
+    return Target(isa, PROCESSORS[instruction_set.architecture].triple, instruction_set.cpu, features)

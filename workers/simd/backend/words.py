@@ -61,10 +61,10 @@ def filled(rows: NDArray, count: int) -> NDArray:
 def unpack(words: Words, avals: Sequence[Any], lanes: int) -> list[NDArray]:
     """Arrays [lane, ...] of words, as copies; `avals` are the shapes and dtypes of one lane."""
     rows = words.transpose(0, 2, 1).copy().reshape(len(words) * words.shape[2], words.shape[1])[:lanes]
-    found, end = [], 0
+    arrays, end = [], 0
     for aval in avals:
         start, end = end, end + words_of(aval)
         column = rows[:, start:end]
         array = column.astype(aval.dtype) if aval.dtype.itemsize < 4 else column.view(aval.dtype)
-        found.append(array.reshape(lanes, *aval.shape))
-    return found
+        arrays.append(array.reshape(lanes, *aval.shape))
+    return arrays

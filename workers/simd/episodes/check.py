@@ -43,9 +43,9 @@ def check_kernel(kernel: Kernel, graph: Graph, outputs: list[int], given_L: np.n
         what: what it computes, for the message.
     """
     words = pack([given_L], kernel.target.width)
-    found = aligned((len(words), kernel.words_out, kernel.target.width))
-    kernel.run(words, found)
-    require_same(_by_lane(found), _words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
+    results = aligned((len(words), kernel.words_out, kernel.target.width))
+    kernel.run(words, results)
+    require_same(_by_lane(results), _words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
 
 
 def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:

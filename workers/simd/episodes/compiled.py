@@ -90,12 +90,12 @@ class EpisodeKernel:
     def results(self, words: Words, lanes: int) -> Episodes:
         """The results of episodes, [L], of the last words of their carries, [block, word, lane]."""
         leaves, structure = jax.tree.flatten(self.carry.episode)
-        found = structure.unflatten(unpack(words, leaves, lanes))
+        episodes = structure.unflatten(unpack(words, leaves, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
-            return found
+            return episodes
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
-        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
-        return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = episodes.shifted_sum_O, episodes.shifted_square_sum_O
+        return episodes._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
 
     def _room_for_steps(self, blocks: int, steps: int) -> Words:
         """Memory for the outputs of each step: [block, step, word, lane]."""
@@ -103,13 +103,13 @@ class EpisodeKernel:
 
     def _steps_kept(self, kept: Words, lanes: int) -> dict[str, np.ndarray]:
         """The outputs of each step by name, [lane, step, ...]."""
-        found, end = {}, 0
+        outputs, end = {}, 0
         for name, place in self.of_steps.items():
             start, end = end, end + len(place)
-            one, steps = self.carry.episode.outputs[name], kept.shape[1]
+            output, steps = self.carry.episode.outputs[name], kept.shape[1]
             words = kept[:, :, start:end].reshape(len(kept), steps * len(place), -1)
-            (found[name],) = unpack(words, [jax.ShapeDtypeStruct((steps, *one.shape), one.dtype)], lanes)
-        return found
+            (outputs[name],) = unpack(words, [jax.ShapeDtypeStruct((steps, *output.shape), output.dtype)], lanes)
+        return outputs
 
     def watch(self, weights: np.ndarray, mean_O: np.ndarray, std_O: np.ndarray, reset_key: np.ndarray) -> Carry:
         """Run one evaluation episode step by step; returns its carries until it is done, with leading axis [T]."""

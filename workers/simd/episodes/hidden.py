@@ -43,7 +43,7 @@ def shared(
     """Write out = f(centre x), for several members at a time.
 
     Args:
-        begins: function (first member, tile, biases) -> with what the sums of these members begin.
+        begins: function (first member, tile, biases) -> first values of the sums of these members.
     """
     floats = builder.llvm_types["f"]
     members = min(builder.width, builder.target.sums_at_once // layer.tile)
@@ -57,15 +57,15 @@ def shared(
             return [builder.load(floats, "%centre", builder.index((at, 1), (v, 1))) for v in range(layer.tile)]
 
         def add(row: str, sums: Values) -> Values:
-            vectors, found = centre(row), []
+            vectors, new_sums = centre(row), []
             for member in range(members):
                 seen = _seen(builder, x, first, member, row)
                 mine = sums[member * layer.tile : (member + 1) * layer.tile]
-                found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
-            return found
+                new_sums += [builder.fma(seen, vector, total) for vector, total in zip(vectors, mine, strict=True)]
+            return new_sums
 
         biases = first_sums(layer.bias, centre(layer.inputs) * members)
-        sums = builder.loop(layer.inputs, add, [(floats, one) for one in begins(first, number, biases)])
+        sums = builder.loop(layer.inputs, add, [(floats, init) for init in begins(first, number, biases)])
         for member in range(members):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -104,20 +104,20 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
 
         def add(row: str, sums: Values) -> Values:
             seen = [_seen(builder, x, first, member, row) for member in range(2 * pairs)]
-            found = list(sums)
+            new_sums = list(sums)
             for v in range(layer.tile):
                 for pair, of_signs in enumerate(member_weights(row, v)):
                     for sign, weight in enumerate(of_signs):
                         place = (2 * pair + sign) * layer.tile + v
-                        found[place] = builder.fma(seen[2 * pair + sign], weight, sums[place])
-            return found
+                        new_sums[place] = builder.fma(seen[2 * pair + sign], weight, sums[place])
+            return new_sums
 
         biases = [""] * (2 * pairs * layer.tile)
         for v in range(layer.tile):
             for pair, of_signs in enumerate(member_weights(layer.inputs, v)):
                 for sign, weight in enumerate(of_signs):
                     biases[(2 * pair + sign) * layer.tile + v] = weight
-        sums = builder.loop(layer.inputs, add, [(floats, one) for one in first_sums(layer.bias, biases)])
+        sums = builder.loop(layer.inputs, add, [(floats, init) for init in first_sums(layer.bias, biases)])
         for member in range(2 * pairs):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -180,15 +180,15 @@ def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
             ]
 
         def add(row: str, sums: Values) -> Values:
-            found = []
+            new_sums = []
             for member, vectors in enumerate(weights(row)):
                 seen = _seen(builder, x, first, member, row)
                 mine = sums[member * wide.tile : (member + 1) * wide.tile]
-                found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
-            return found
+                new_sums += [builder.fma(seen, vector, total) for vector, total in zip(vectors, mine, strict=True)]
+            return new_sums
 
         biases = [vector for vectors in weights(layer.inputs) for vector in vectors]
-        sums = builder.loop(layer.inputs, add, [(floats, one) for one in first_sums(layer.bias, biases)])
+        sums = builder.loop(layer.inputs, add, [(floats, init) for init in first_sums(layer.bias, biases)])
         for member in range(members):
             _put(builder, wide, out, first, member, number, sums[member * wide.tile : (member + 1) * wide.tile])
         return []

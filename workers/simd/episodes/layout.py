@@ -49,9 +49,9 @@ class Network(NamedTuple):
     places: NDArray[np.uint32]
     """Places in the flat vector of parameters: of the vectors, then of the single weights."""
     target: Target
-    """What the code is for, whose vectors these are."""
+    """Target of the code, whose vectors these are."""
     output: Output
-    """What the last layer's sums become; all but `tanh` are made of them elsewhere."""
+    """Function of the last layer's sums; all but `tanh` are computed elsewhere."""
     bias: bool
 
     @property

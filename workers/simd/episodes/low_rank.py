@@ -64,15 +64,15 @@ def plan_noise(
     singles: list[NDArray[np.uint32]] = []
     first, left, rows = [], [], inputs_O
     *below, last = noise = layers_of_noise(spec, rank)
-    for layer, one in zip(hidden, below, strict=True):
+    for layer, layer_noise in zip(hidden, below, strict=True):
         first.append(len(vectors))
-        starts = [row[0] for row in (*one.right, *([] if one.bias is None else [one.bias]))]
+        starts = [row[0] for row in (*layer_noise.right, *([] if layer_noise.bias is None else [layer_noise.bias]))]
         for tile in range(0, layer.tiles * layer.tile, layer.tile):
             vectors += [int(start) + (tile + v) * width for start in starts for v in range(layer.tile)]
-    for one in noise:
+    for layer_noise in noise:
         left.append(sum(map(len, singles)))
-        singles.append(one.left[:, rows].T.reshape(-1))
-        rows = np.arange(one.right.shape[1])
+        singles.append(layer_noise.left[:, rows].T.reshape(-1))
+        rows = np.arange(layer_noise.right.shape[1])
     right = sum(map(len, singles))
     singles += [last.right.reshape(-1), *([] if last.bias is None else [last.bias])]
     places = np.concatenate([np.array(vectors, np.uint32), *singles])
@@ -88,19 +88,20 @@ def thin_sums(builder: FunctionBuilder, noise: LowRankNoise, layer: int, inputs:
         seen = builder.load(floats, x, row)
         places = [builder.index((row, rank), (noise.left[layer] + r, 1)) for r in range(rank)]
         return [
-            builder.fma(seen, _integer(builder, singles, place), one) for place, one in zip(places, sums, strict=True)
+            builder.fma(seen, _integer(builder, singles, place), total)
+            for place, total in zip(places, sums, strict=True)
         ]
 
     sums = builder.loop(inputs, add, [(floats, "zeroinitializer")] * rank)
     signed = by_sign(builder, builder.splat(unit))
-    return [builder.value(f"fmul {floats} {one}, {signed}") for one in sums]
+    return [builder.value(f"fmul {floats} {total}, {signed}") for total in sums]
 
 
 def begins_of_hidden(
     builder: FunctionBuilder, noise: LowRankNoise, layer: Layer, number: int, thin: str
 ) -> Callable[[str, str, Values], Values]:
-    """Function (first member, tile, the centre's biases of each member and vector of the tile) -> with what the sums of
-    these members begin, for hidden layer `number`.
+    """Function (first member, tile, the centre's biases of each member and vector of the tile) -> first values of the
+    sums of these members, for hidden layer `number`.
 
     Args:
         thin: the vectors of `thin_sums` in memory.
@@ -110,7 +111,7 @@ def begins_of_hidden(
     rows = noise.rank + noise.bias
 
     def begins(first: str, tile: str, biases: Values) -> Values:
-        first_pair, found = builder.value(f"lshr i64 {first}, 1"), list(biases)
+        first_pair, sums = builder.value(f"lshr i64 {first}, 1"), list(biases)
         for pair in range(len(biases) // layer.tile // 2):
             start = builder.index((first_pair, noise.vectors), (pair * noise.vectors + noise.first[number], 1))
             start = builder.index((start, 1), (tile, rows * layer.tile))
@@ -126,8 +127,8 @@ def begins_of_hidden(
                 factors = [builder.splat(builder.load("float", thin, place)) for place in at]
                 for v in range(layer.tile):
                     place = member * layer.tile + v
-                    found[place] = _moved(builder, noise, found[place], vectors[v], unit, factors)
-        return found
+                    sums[place] = _moved(builder, noise, sums[place], vectors[v], unit, factors)
+        return sums
 
     return begins
 
@@ -135,7 +136,7 @@ def begins_of_hidden(
 def begins_of_last(
     builder: FunctionBuilder, noise: LowRankNoise, outputs: range, count: int, biases: Values, thin: Values
 ) -> Values:
-    """With what the sums of some outputs of the last layer begin, a member in each lane.
+    """First values of the sums of some outputs of the last layer, a member in each lane.
 
     Args:
         count: how many outputs the layer has.
@@ -143,11 +144,11 @@ def begins_of_last(
         thin: the vectors of `thin_sums`.
     """
     singles, unit = noise.singles(builder), by_sign(builder, builder.splat("%unit"))
-    found = []
+    sums = []
     for output, bias in zip(outputs, biases, strict=True):
         rows = [noise.right + row * count + output for row in range(noise.rank + noise.bias)]
-        found.append(_moved(builder, noise, bias, [_integer(builder, singles, row) for row in rows], unit, thin))
-    return found
+        sums.append(_moved(builder, noise, bias, [_integer(builder, singles, row) for row in rows], unit, thin))
+    return sums
 
 
 def _moved(builder: FunctionBuilder, noise: LowRankNoise, value: str, rows: Values, unit: str, factors: Values) -> str:

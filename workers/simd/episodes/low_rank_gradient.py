@@ -105,11 +105,11 @@ def gradient_module(target: Target) -> str:
 
     def added(factor: str, place: str, sums: Values) -> Values:
         vectors = [builder.value(f"load {floats}, ptr {at}, align 4") for at in group_at("%rows", place)]
-        return [builder.fma(builder.splat(factor), vector, one) for vector, one in zip(vectors, sums, strict=True)]
+        return [builder.fma(builder.splat(factor), vector, total) for vector, total in zip(vectors, sums, strict=True)]
 
     def write(scale: str, sums: Values, place: str) -> None:
-        for at, one in zip(group_at("%sums", place), sums, strict=True):
-            builder.do(f"store {floats} {builder.value(f'fmul {floats} {one}, {scale}')}, ptr {at}, align 4")
+        for at, total in zip(group_at("%sums", place), sums, strict=True):
+            builder.do(f"store {floats} {builder.value(f'fmul {floats} {total}, {scale}')}, ptr {at}, align 4")
 
     zeros = [(floats, "zeroinitializer")] * UNROLLED
 
@@ -133,7 +133,7 @@ def gradient_module(target: Target) -> str:
                         place = builder.index((of_pair, 1), (right, 1), (at_right, 1), (j, group))
                         return added(builder.value(f"fmul float {weight}, {a}"), place, sums)
 
-                    return builder.loop("%rank", add_rank, [(floats, one) for one in sums])
+                    return builder.loop("%rank", add_rank, [(floats, total) for total in sums])
 
                 write(of_products, builder.loop("%pairs", add_pair, zeros), builder.index((first, 1), (j, group)))
                 return []

@@ -117,7 +117,7 @@ def _last(
     """Write action = f(weights x) for some outputs, with f = tanh or none; the lanes of a vector are members.
 
     Args:
-        begins: function (outputs, their biases) -> with what their sums begin.
+        begins: function (outputs, their biases) -> first values of their sums.
     """
     floats, count = builder.llvm_types["f"], network.outputs
     singles = "" if weights == "own" else builder.at("%centre", network.vectors * builder.width, "float")
@@ -134,19 +134,19 @@ def _last(
     of_row = own_weights if weights == "own" else centre
     if weights == "perturbed":
         noise = builder.at("%noise", network.vectors * (builder.width // 2) * builder.width, "i8")
-        unit, twice = (by_sign(builder, one) for one in units(builder))
+        unit, twice = (by_sign(builder, vector) for vector in units(builder))
 
         def of_row(row: str | int) -> Values:
             js = [noise_of_weights(builder, noise, builder.index((row, count), (output, 1))) for output in outputs]
-            moved = [builder.value(f"fadd {floats} {one}, {unit}") for one in centre(row)]
-            return [builder.fma(j, twice, one) for j, one in zip(js, moved, strict=True)]
+            moved = [builder.value(f"fadd {floats} {weight}, {unit}") for weight in centre(row)]
+            return [builder.fma(j, twice, weight) for j, weight in zip(js, moved, strict=True)]
 
     def add(row: str, sums: Values) -> Values:
         seen = builder.load(floats, x, row)
-        return [builder.fma(seen, weight, one) for weight, one in zip(of_row(row), sums, strict=True)]
+        return [builder.fma(seen, weight, total) for weight, total in zip(of_row(row), sums, strict=True)]
 
     biases = begins(outputs, first_sums(network.bias, of_row(network.inputs)))
-    sums = builder.loop(network.inputs, add, [(floats, one) for one in biases])
+    sums = builder.loop(network.inputs, add, [(floats, init) for init in biases])
     sums = activated(builder, "tanh", sums) if network.output == "tanh" else sums
     for output, value in zip(outputs, sums, strict=True):
         builder.store(floats, value, "%action", output)

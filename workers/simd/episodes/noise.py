@@ -51,8 +51,8 @@ def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
     for word in range(KEY_WORDS):
         vector = "poison"
         for lane in range(builder.width):
-            one = builder.load("i32", keys, lane // 2 * KEY_WORDS + word)
-            vector = builder.value(f"insertelement {builder.llvm_types['i']} {vector}, i32 {one}, i64 {lane}")
+            key_word = builder.load("i32", keys, lane // 2 * KEY_WORDS + word)
+            vector = builder.value(f"insertelement {builder.llvm_types['i']} {vector}, i32 {key_word}, i64 {lane}")
         words.append(vector)
     return words
 
@@ -135,17 +135,17 @@ def gradient_module(target: Target) -> str:
         def add(pair: str, sums: Values) -> Values:
             key = load_key(builder, "%keys", pair)
             weight = builder.splat(builder.load("float", "%weights", pair))
-            found = []
-            for coordinate, one in zip(coordinates, sums, strict=True):
+            new_sums = []
+            for coordinate, total in zip(coordinates, sums, strict=True):
                 k = noise_of(builder, key, coordinate, halved=False)
-                found.append(
-                    builder.fma(weight, builder.value(f"sitofp {builder.llvm_types['i']} {k} to {floats}"), one)
+                new_sums.append(
+                    builder.fma(weight, builder.value(f"sitofp {builder.llvm_types['i']} {k} to {floats}"), total)
                 )
-            return found
+            return new_sums
 
         scale = builder.splat(float_constant(np.float32(1.0 / NORMAL_STD)))
-        for vector, one in enumerate(builder.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
-            scaled = builder.value(f"fmul {floats} {one}, {scale}")
+        for vector, total in enumerate(builder.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
+            scaled = builder.value(f"fmul {floats} {total}, {scale}")
             builder.store(floats, scaled, "%sums", builder.index((number, UNROLLED), (vector, 1)))
         return []
 

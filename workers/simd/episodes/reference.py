@@ -92,7 +92,7 @@ def perturbed(centre_D: Floats, unit: np.float32, noise_keys_P: Any) -> WeightsO
 
 
 def low_rank(spec: PolicySpec, rank: int, unit: np.float32, noise_keys_P: Any) -> Moved:
-    """What noise of low rank adds to the sums of both members of each pair, which share the centre's weights."""
+    """Terms of noise of low rank in the sums of both members of each pair, which share the centre's weights."""
     coordinates_N = np.arange(numbers(spec, rank), dtype=np.uint32)
     k_P_N = np.stack([normal_integers(np, key, coordinates_N) for key in noise_keys_P]).astype(np.float32)
     k_N_L = np.repeat(k_P_N, 2, axis=0).T

@@ -124,13 +124,16 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     def rollout(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernel = kernels.fitting(mean_L_O)
         rows, addresses_N = kernel.network.room_for_own(sum(map(len, policies)), spec.policy.parameters)
-        for first, one in zip(accumulate(map(len, policies), initial=0), policies, strict=False):
-            part = rows[first : first + len(one)]
-            if isinstance(one, Recipes):
-                make(one, part)
+        for first, parameters_N_D in zip(accumulate(map(len, policies), initial=0), policies, strict=False):
+            part = rows[first : first + len(parameters_N_D)]
+            if isinstance(parameters_N_D, Recipes):
+                make(parameters_N_D, part)
             else:
-                require(one.shape == part.shape, f"parameters {one.shape} have the wrong shape, not {part.shape}")
-                part[...] = one
+                require(
+                    parameters_N_D.shape == part.shape,
+                    f"parameters {parameters_N_D.shape} have the wrong shape, not {part.shape}",
+                )
+                part[...] = parameters_N_D
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
         return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 

@@ -24,10 +24,10 @@ from workers.simd.episodes.noise import definition, float_constant, lanes, load_
 
 
 class Variation(Protocol):
-    """What makes the policies of recipes."""
+    """Maker of policies from recipes."""
 
     def __call__(self, recipes: Recipes, out_N_D: FloatArray | None = None) -> FloatArray:
-        """Their parameters, [N, D], in an array that is given or a new one."""
+        """Their parameters, [N, D], in a given or a new array."""
         ...
 
 
@@ -106,7 +106,7 @@ def variation_module(target: Target) -> str:
             first = builder.splat(builder.value(f"trunc i64 {start} to i32"), "i")
             noise = variate(key, builder.value(f"add {integer} {first}, {lanes(builder)}"))
             seen_x, seen_y = (
-                builder.value(f"load {floats}, ptr {builder.at(one, start, 'float')}, align 4") for one in (x, y)
+                builder.value(f"load {floats}, ptr {builder.at(parent, start, 'float')}, align 4") for parent in (x, y)
             )
             moved = builder.value(f"fadd {floats} {builder.value(f'fmul {floats} {iso}, {noise}')}, {seen_x}")
             between = builder.value(f"fsub {floats} {seen_y}, {seen_x}")

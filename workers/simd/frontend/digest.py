@@ -23,9 +23,9 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
     """
     digests: dict[int, str] = {}
 
-    def of_closed(one: ClosedJaxpr) -> str:
-        hasher = hashlib.sha256(of_jaxpr(one.jaxpr).encode())
-        for constant in one.consts:
+    def of_closed(closed_jaxpr: ClosedJaxpr) -> str:
+        hasher = hashlib.sha256(of_jaxpr(closed_jaxpr.jaxpr).encode())
+        for constant in closed_jaxpr.consts:
             hasher.update(of_value(constant).encode())
         return hasher.hexdigest()
 

@@ -81,10 +81,10 @@ class Tracer:
 
     def values(self, nodes: Nodes) -> NDArray | None:
         """Values of an array of nodes if all of them are constants, else None."""
-        found = [self.graph.constant(node) for node in nodes.reshape(-1).tolist()]
-        if any(value is None for value in found):
+        constants = [self.graph.constant(node) for node in nodes.reshape(-1).tolist()]
+        if any(value is None for value in constants):
             return None
-        return np.array(found).reshape(nodes.shape)
+        return np.array(constants).reshape(nodes.shape)
 
     def map(self, function: Callable[..., int], *arrays: Nodes) -> Nodes:
         """Array of a function's results for each element of the arrays, whose shapes are equal or ()."""

@@ -57,7 +57,7 @@ class Gpu:
 
     @property
     def target(self) -> Target:
-        """What functions for it are built for."""
+        """Target of functions for it."""
         return target_of("ptx")
 
     def module(self, functions: Sequence[FunctionBuilder]) -> Module:
@@ -91,9 +91,9 @@ class Gpu:
 
     def copied(self, array: Any) -> GpuArray:
         """A copy of an array in the GPU's memory."""
-        found = self.array(array.shape, array.dtype)
-        found.write(array)
-        return found
+        copy = self.array(array.shape, array.dtype)
+        copy.write(array)
+        return copy
 
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
@@ -117,11 +117,11 @@ class GpuArray:
 
     def read(self, first: int = 0, rows: int | None = None) -> Any:
         """Rows of the array, all by default; waits for the kernels that were launched before."""
-        found = np.empty((self.shape[0] - first if rows is None else rows, *self.shape[1:]), self.dtype)
+        array = np.empty((self.shape[0] - first if rows is None else rows, *self.shape[1:]), self.dtype)
         start = self.pointer.value + first * int(np.prod(self.shape[1:])) * self.dtype.itemsize
-        here = ctypes.c_void_p(found.ctypes.data)
-        self._gpu._call("cuMemcpyDtoH_v2", here, ctypes.c_uint64(start), _size(found.nbytes))
-        return found
+        here = ctypes.c_void_p(array.ctypes.data)
+        self._gpu._call("cuMemcpyDtoH_v2", here, ctypes.c_uint64(start), _size(array.nbytes))
+        return array
 
     def __del__(self) -> None:
         """Free the memory; at the end of the process the driver does it."""
@@ -145,8 +145,8 @@ class Module:
             function = ctypes.c_void_p()
             self._gpu._call("cuModuleGetFunction", ctypes.byref(function), self._module, name.encode())
             self._functions[name] = function
-        values = [one.pointer if isinstance(one, GpuArray) else one for one in arguments]
-        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(one) for one in values))
+        values = [argument.pointer if isinstance(argument, GpuArray) else argument for argument in arguments]
+        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
         grid, one = ctypes.c_uint(-(-threads // THREADS)), ctypes.c_uint(1)
         self._gpu._call(
             "cuLaunchKernel", self._functions[name], grid, one, one, ctypes.c_uint(THREADS), one, one,

@@ -74,7 +74,7 @@ def noise_bytes(key: Any, place_T: Any) -> Any:
     j_T = ((normal_integers(jnp, key, place_T) - 1) >> 1) + BIAS_OF_BYTES
     shifted_T = j_T.astype(jnp.uint32) << (8 * (jnp.arange(TILE, dtype=jnp.uint32) % 4))
     first, second = shifted_T[:4], shifted_T[4:]
-    return jnp.stack([one[0] | one[1] | one[2] | one[3] for one in (first, second)])
+    return jnp.stack([half[0] | half[1] | half[2] | half[3] for half in (first, second)])
 
 
 def fill_function(noise: FunctionBuilder, target: Target) -> FunctionBuilder:
@@ -91,7 +91,7 @@ def fill_function(noise: FunctionBuilder, target: Target) -> FunctionBuilder:
         builder.at("%places", builder.index((row, TILE)), "i32"),
         builder.at("%noises", builder.index(("%lane", 2)), "i32"),
     ]
-    builder.do(f"call void @{noise.name}({', '.join(f'ptr {one}' for one in given)})")
+    builder.do(f"call void @{noise.name}({', '.join(f'ptr {pointer}' for pointer in given)})")
     return builder
 
 
@@ -101,7 +101,7 @@ def layer_function(layer: GpuLayer, target: Target) -> FunctionBuilder:
     numbers = ["float %unit", "i64 %pairs", "i64 %lanes", "i64 %lane"]
     builder = FunctionBuilder(f"{layer.name}_of_lane", [*pointers, *numbers], target)
     floats, (unit, twice) = builder.llvm_types["f"], units(builder)
-    minus_unit, minus_twice = (builder.value(f"fneg {floats} {one}") for one in (unit, twice))
+    minus_unit, minus_twice = (builder.value(f"fneg {floats} {vector}") for vector in (unit, twice))
     tile, pair = _row_and_pair(builder)
     members, member = builder.index(("%pairs", 2)), builder.index((pair, 2))
     first = builder.index((tile, layer.rows_of_tile), (layer.first, 1))
@@ -111,22 +111,22 @@ def layer_function(layer: GpuLayer, target: Target) -> FunctionBuilder:
     def weights_of(row: str | int) -> Values:
         """Weights of both members, [output, sign]."""
         j_T = _noise(builder, builder.at(noises, builder.value(f"mul i64 {row}, %pairs"), "i64"))
-        found = []
+        weights = []
         for j, c in zip(j_T, _vector(builder, builder.at(centre, builder.index((row, TILE)), "float"), 4), strict=True):
             plus = builder.fma(j, twice, builder.value(f"fadd {floats} {c}, {unit}"))
             if layer.is_last:
                 minus = builder.fma(j, minus_twice, builder.value(f"fadd {floats} {c}, {minus_unit}"))
             else:
                 minus = builder.value(f"fsub {floats} {builder.value(f'fadd {floats} {c}, {c}')}, {plus}")
-            found += [plus, minus]
-        return found
+            weights += [plus, minus]
+        return weights
 
     def add(row: str, sums: Values) -> Values:
         x_S = _vector(builder, builder.at(seen, builder.value(f"mul i64 {row}, {members}"), "float"), 2, 1)
         return [builder.fma(x_S[k % 2], w, s) for k, (w, s) in enumerate(zip(weights_of(row), sums, strict=True))]
 
     begin = weights_of(layer.inputs) if layer.bias else ["zeroinitializer"] * 2 * TILE
-    sums = builder.loop(layer.inputs, add, [(floats, one) for one in begin])
+    sums = builder.loop(layer.inputs, add, [(floats, init) for init in begin])
     if layer.activation is not None:
         sums = activated(builder, layer.activation, sums)
     out = builder.at("%out", member, "float")
@@ -143,26 +143,26 @@ def _row_and_pair(builder: FunctionBuilder) -> tuple[str, str]:
 
 def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE // 4) -> Values:
     """Neighbouring floats in memory, each as a vector of one lane, by loads of `size`."""
-    found, whole = [], f"<{size} x float>"
+    vectors, whole = [], f"<{size} x float>"
     for number in range(loads):
         place = builder.at(pointer, number, whole)
         loaded = builder.value(f"load {whole}, ptr {place}, align {4 * size}")
-        one = f"shufflevector {whole} {loaded}, {whole} poison, <1 x i32>"
-        found += [builder.value(f"{one} <i32 {k}>") for k in range(size)]
-    return found
+        shuffle = f"shufflevector {whole} {loaded}, {whole} poison, <1 x i32>"
+        vectors += [builder.value(f"{shuffle} <i32 {k}>") for k in range(size)]
+    return vectors
 
 
 def _noise(builder: FunctionBuilder, pointer: str) -> Values:
     """The noise j of a row of a tile as floats: the difference of 2^23 + byte, which needs no conversion, and of 2^23
     plus the bias of bytes. Both are exact."""
     floats, word = builder.llvm_types["f"], builder.value(f"load i64, ptr {pointer}, align 8")
-    halves = [builder.value(f"trunc i64 {one} to i32") for one in (word, builder.value(f"lshr i64 {word}, 32"))]
+    halves = [builder.value(f"trunc i64 {source} to i32") for source in (word, builder.value(f"lshr i64 {word}, 32"))]
     offset = struct.pack(">d", -(2.0**23 + BIAS_OF_BYTES)).hex().upper()
-    found = []
+    j_T = []
     for k in range(TILE):
         shifted = builder.value(f"lshr i32 {halves[k // 4]}, {8 * (k % 4)}")
         byte = builder.value(f"and i32 {shifted}, 255")
         bits = builder.value(f"or i32 {byte}, {0x4B000000}")
         number = builder.value(f"bitcast i32 {bits} to {floats}")
-        found.append(builder.value(f"fadd {floats} {number}, splat (float 0x{offset})"))
-    return found
+        j_T.append(builder.value(f"fadd {floats} {number}, splat (float 0x{offset})"))
+    return j_T

@@ -90,16 +90,16 @@ class GpuEpisodes:
         Raises WrongCodeError if new code does not compute the first episodes as the processor does.
         """
         with self._lock:
-            found = self._run(kernel, centre_D, unit, *given)
+            episodes = self._run(kernel, centre_D, unit, *given)
             if (key := kernel.inputs_O.tobytes()) not in self._checked:
                 mean_O, std_O, *keys = given
-                few = [one[: CHECKED * of_each] for one, of_each in zip(keys, (1, 2, 2), strict=True)]
+                few = [array[: CHECKED * of_each] for array, of_each in zip(keys, (1, 2, 2), strict=True)]
                 wanted = kernel.run(kernel.network.pack(centre_D), unit, mean_O, std_O, *few)
-                for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+                for leaf, other in zip(jax.tree.leaves(episodes), jax.tree.leaves(wanted), strict=True):
                     what = f"episodes of {self._spec.environment}"
-                    require_same(one[: len(other)], other, what, self._gpu.name)
+                    require_same(leaf[: len(other)], other, what, self._gpu.name)
                 self._checked.add(key)
-            return found
+            return episodes
 
     def _run(
         self,

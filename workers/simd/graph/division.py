@@ -38,14 +38,14 @@ def whole_quotient(g: Graph, a: int, b: int, dtype: str) -> int:
 
     a / 0 has all bits set, and the least integer divided by -1 is itself.
     """
-    found = g.op("sdiv" if dtype == "int32" else "udiv", a, _safe_divisor(g, a, b, dtype))
-    return found if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), g.i(-1), found)
+    quotient = g.op("sdiv" if dtype == "int32" else "udiv", a, _safe_divisor(g, a, b, dtype))
+    return quotient if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), g.i(-1), quotient)
 
 
 def whole_remainder(g: Graph, a: int, b: int, dtype: str) -> int:
     """Remainder a - b * (a / b) of integers, with the quotient rounded towards zero; it is a where b is 0."""
-    found = g.op("srem" if dtype == "int32" else "urem", a, _safe_divisor(g, a, b, dtype))
-    return found if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), a, found)
+    rest = g.op("srem" if dtype == "int32" else "urem", a, _safe_divisor(g, a, b, dtype))
+    return rest if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), a, rest)
 
 
 def _is_constant_but_zero(g: Graph, node: int) -> bool:

@@ -205,9 +205,9 @@ def exp2(g: Graph, x: int) -> int:
     rest = g.op("mul", g.op("sub", x, g.op("sub", powers, g.f(ROUNDER))), g.f(math.log(2.0)))
     less_one = g.op("fma", g.op("mul", rest, rest), _horner(g, rest, EXPM1), rest)
     half = _times_half_power(g, g.op("add", less_one, g.f(1.0)), g.op("bits", powers))
-    found = g.op("select", g.op("lt", x, g.f(-125.0)), g.f(0.0), g.op("add", half, half))
-    found = g.op("select", g.op("le", g.f(128.0), x), g.f(math.inf), found)
-    return _nan_where_nan(g, x, found)
+    exponential = g.op("select", g.op("lt", x, g.f(-125.0)), g.f(0.0), g.op("add", half, half))
+    exponential = g.op("select", g.op("le", g.f(128.0), x), g.f(math.inf), exponential)
+    return _nan_where_nan(g, x, exponential)
 
 
 def log(g: Graph, x: int) -> int:
@@ -220,20 +220,20 @@ def log(g: Graph, x: int) -> int:
     curve = g.op("mul", g.op("mul", rest, square), _horner(g, rest, LOG1P))
     curve = g.op("fma", k, g.f(LOG_2[1]), curve)
     curve = g.op("fma", square, g.f(-0.5), curve)
-    found = g.op("fma", k, g.f(LOG_2[0]), g.op("add", rest, curve))
-    found = g.op("select", g.op("lt", x, g.f(math.inf)), found, x)  # infinity and NaN are their own logarithms
-    found = g.op("select", g.op("lt", x, g.f(0.0)), g.f(math.nan), found)
-    return g.op("select", g.op("lt", g.op("abs", x), g.f(1.1754944e-38)), g.f(-math.inf), found)
+    logarithm = g.op("fma", k, g.f(LOG_2[0]), g.op("add", rest, curve))
+    logarithm = g.op("select", g.op("lt", x, g.f(math.inf)), logarithm, x)  # infinity and NaN are their own logarithms
+    logarithm = g.op("select", g.op("lt", x, g.f(0.0)), g.f(math.nan), logarithm)
+    return g.op("select", g.op("lt", g.op("abs", x), g.f(1.1754944e-38)), g.f(-math.inf), logarithm)
 
 
 def log1p(g: Graph, x: int) -> int:
     """log(1 + x), within 3 ulp; -inf at -1, NaN below."""
     one_more = g.op("add", x, g.f(1.0))
     lost = g.op("sub", x, g.op("sub", one_more, g.f(1.0)))
-    found = g.op("add", log(g, one_more), g.op("div", lost, one_more))
-    found = g.op("select", g.op("lt", one_more, g.f(math.inf)), found, one_more)
-    found = g.op("select", g.op("eq", one_more, g.f(0.0)), g.f(-math.inf), found)
-    return g.op("select", g.op("lt", g.op("abs", x), g.f(1e-7)), x, found)
+    logarithm = g.op("add", log(g, one_more), g.op("div", lost, one_more))
+    logarithm = g.op("select", g.op("lt", one_more, g.f(math.inf)), logarithm, one_more)
+    logarithm = g.op("select", g.op("eq", one_more, g.f(0.0)), g.f(-math.inf), logarithm)
+    return g.op("select", g.op("lt", g.op("abs", x), g.f(1e-7)), x, logarithm)
 
 
 def tanh(g: Graph, x: int) -> int:
@@ -261,14 +261,14 @@ def whole_power(g: Graph, x: int, exponent: int) -> int:
     """x to a whole power, by squaring; the error in ulp is at most |exponent|."""
     if exponent < 0:
         return g.op("div", g.f(1.0), whole_power(g, x, -exponent))
-    found, square = g.f(1.0), x
+    power, square = g.f(1.0), x
     while exponent:
         if exponent & 1:
-            found = g.op("mul", found, square)
+            power = g.op("mul", power, square)
         exponent >>= 1
         if exponent:
             square = g.op("mul", square, square)
-    return found
+    return power
 
 
 def pow(g: Graph, x: int, y: int) -> int:

@@ -113,7 +113,7 @@ def _fold_neg(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int 
     key = g.keys[args[0]]
     if key[0] == "neg":
         return key[1]
-    if key[0] != "sub" or all(g.keys[one][0] == "mul" for one in key[1:]):
+    if key[0] != "sub" or all(g.keys[argument][0] == "mul" for argument in key[1:]):
         return None  # a difference of two products is fused with the second, so p - q and q - p round differently
     return g.op("sub", key[2], key[1])
 
@@ -136,8 +136,8 @@ def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> i
     if values[0] is not None:
         return a if values[0] else b
     key = g.keys[mask]
-    for one, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
-        if _is(g.constant(one), True):  # the mask is the negation of `other`
+    for argument, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
+        if _is(g.constant(argument), True):  # the mask is the negation of `other`
             return g.op("iselect" if g.dtypes[a] == "i" else "select", other, b, a)
     return None
 
@@ -155,12 +155,12 @@ def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
 
 def _fold_xor(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
-    for one, other, value in ((a, b, values[0]), (b, a, values[1])):
+    for argument, other, value in ((a, b, values[0]), (b, a, values[1])):
         if value is not None and not value:
             return other
         key = g.keys[other]
-        if value is not None and key[0] == "xor" and one in key[1:]:
-            return key[2] if key[1] == one else key[1]  # not (not x)
+        if value is not None and key[0] == "xor" and argument in key[1:]:
+            return key[2] if key[1] == argument else key[1]  # not (not x)
     return None
 
 

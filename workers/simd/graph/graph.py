@@ -90,7 +90,7 @@ class Graph:
         return self.arguments(node)
 
     def loop(self, trips: int, inits: list[int]) -> Loop:
-        """Open a loop whose body is what is then built from its carries; `close` ends it."""
+        """Open a loop whose body is built next from its carries; `close` ends it."""
         number = len(self.loops)
         dtypes = [self.dtypes[node] for node in inits]
         carries = [self._node(("carry", dtype, number, k), dtype) for k, dtype in enumerate(dtypes)]
@@ -138,28 +138,28 @@ def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
 
 def reached(starts: Iterable[int], needs: Callable[[int], Iterable[int]]) -> set[int]:
     """All nodes that can be reached from `starts` through `needs`, including `starts`."""
-    found: set[int] = set()
+    nodes: set[int] = set()
     waiting = list(starts)
     while waiting:
         node = waiting.pop()
-        if node not in found:
-            found.add(node)
+        if node not in nodes:
+            nodes.add(node)
             waiting += needs(node)
-    return found
+    return nodes
 
 
 def depending(graph: Graph, loop: Loop) -> set[int]:
-    """Nodes of a loop's body: all nodes that depend on its carries, except its results and what depends on those."""
-    found = set(loop.carries)
+    """Nodes of a loop's body: all nodes that depend on its carries, except its results and their dependents."""
+    body = set(loop.carries)
     size = 0
-    while len(found) != size:  # the carries of an inner loop have lower numbers than their ends, so repeat
-        size = len(found)
-        for node in range(min(found, default=0), len(graph.keys)):
-            if node not in found and not found.isdisjoint(graph.needs(node)):
+    while len(body) != size:  # the carries of an inner loop have lower numbers than their ends, so repeat
+        size = len(body)
+        for node in range(min(body, default=0), len(graph.keys)):
+            if node not in body and not body.isdisjoint(graph.needs(node)):
                 key = graph.keys[node]
                 if key[0] != "result" or key[2] != loop.number:
-                    found.add(node)
+                    body.add(node)
         # An inner loop is inside with all of its carries or with none.
-        numbers = {graph.keys[node][2] for node in found if graph.keys[node][0] == "carry"}
-        found.update(carry for number in numbers for carry in graph.loops[number].carries)
-    return found
+        numbers = {graph.keys[node][2] for node in body if graph.keys[node][0] == "carry"}
+        body.update(carry for number in numbers for carry in graph.loops[number].carries)
+    return body

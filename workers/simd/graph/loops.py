@@ -58,13 +58,13 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
         carries[k] = inits[k]  # no trip reads it
     new_outs = body(carries)
     results = graph.close(reduced, [new_outs[k] for k in kept])
-    found = list(inits)  # carries that never change
+    all_results = list(inits)  # carries that never change
     for k, result in zip(kept, results, strict=True):
-        found[k] = result
+        all_results[k] = result
     ends = dict(zip((outs[k] for k in kept), results, strict=True))
     for k in (*derived, *late):
-        found[k] = substitute(graph, outs[k], ends)
-    return found
+        all_results[k] = substitute(graph, outs[k], ends)
+    return all_results
 
 
 def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
@@ -112,13 +112,13 @@ def _made_of(graph: Graph, node: int, ends: set[int], inside: set[int]) -> bool:
     if node in inside and not waiting:
         return False  # another carry, or the result of an inner loop
     while waiting:
-        one = waiting.pop()
-        if one in seen or one not in inside or one in ends:
+        argument = waiting.pop()
+        if argument in seen or argument not in inside or argument in ends:
             continue
-        seen.add(one)
-        if not graph.arguments(one):
+        seen.add(argument)
+        if not graph.arguments(argument):
             return False
-        waiting += graph.arguments(one)
+        waiting += graph.arguments(argument)
     return True
 
 

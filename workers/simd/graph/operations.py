@@ -138,8 +138,8 @@ def compute(name: str, arguments: Sequence[Any]) -> Any:
         if name in ROUNDED:
             exact = operation.meaning(*(np.asarray(x, np.float64) for x in arguments))
             return np.asarray(_flushed(exact, LEAST_KEPT), np.float32)
-        found = np.asarray(operation.meaning(*arguments), NUMPY_DTYPES[operation.gives])
-    return _flushed(found) if operation.gives == "f" and name not in BIT_MOVES else found
+        result = np.asarray(operation.meaning(*arguments), NUMPY_DTYPES[operation.gives])
+    return _flushed(result) if operation.gives == "f" and name not in BIT_MOVES else result
 
 
 def _flushed(x: Any, least: float = SMALLEST_NORMAL) -> Any:

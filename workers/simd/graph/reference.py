@@ -50,12 +50,12 @@ def evaluate(
 
     def computed(node: int) -> np.ndarray:
         product = order.fused.get(node) if fuse else None
-        arguments = [value(one) for one in graph.arguments(node)]
+        arguments = [value(argument) for argument in graph.arguments(node)]
         seen(node, arguments)
         if product is None:
             return compute_operation(graph.keys[node][0], arguments)
         left, right = graph.arguments(node)
-        a, b = (value(one) for one in graph.arguments(product))
+        a, b = (value(argument) for argument in graph.arguments(product))
         if graph.keys[node][0] == "sub" and product == right:
             return compute_operation("fma", [-a, b, value(left)])
         if graph.keys[node][0] == "sub":
@@ -71,10 +71,10 @@ def evaluate(
             assert loop is not None
             carried = {k: value(loop.inits[k]) for k in step.carried}
             for _ in range(loop.trips):
-                values.update({loop.carries[k]: one for k, one in carried.items()})
+                values.update({loop.carries[k]: array for k, array in carried.items()})
                 run(step)
                 carried = {k: value(loop.outs[k]) for k in step.carried}
-            values.update({loop.results[k]: one for k, one in carried.items()})
+            values.update({loop.results[k]: array for k, array in carried.items()})
 
     run(order.region)
     return [value(node) for node in outputs]

@@ -73,7 +73,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
                 waiting.pop()
                 continue
             first = outside[key[2]] if key[0] == "result" else needs(node)
-            missing = [one for one in first if one not in done and home[one] == number and _is_made(graph, one)]
+            missing = [need for need in first if need not in done and home[need] == number and _is_made(graph, need)]
             if missing:
                 waiting += reversed(missing)
                 continue
@@ -81,7 +81,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
             if key[0] == "result":
                 inner = graph.loops[key[2]]
                 region.steps.append(build(inner.number, ()))
-                region.wanted_inside.update(one for one in outside[key[2]] if home[one] == number)
+                region.wanted_inside.update(need for need in outside[key[2]] if home[need] == number)
                 done.update(inner.results)
             else:
                 region.steps.append(node)
@@ -98,9 +98,9 @@ def _is_made(graph: Graph, node: int) -> bool:
 
 def _outside(loop: Loop, body: set[int], needed: set[int], needs: Callable[[int], tuple[int, ...]]) -> list[int]:
     """Nodes outside of a loop that the loop or a loop inside it reads or starts from."""
-    found = {one for node in body for one in needs(node)}
-    found.update(loop.inits[k] for k, carry in enumerate(loop.carries) if carry in needed)
-    return sorted(found - body)
+    sources = {need for node in body for need in needs(node)}
+    sources.update(loop.inits[k] for k, carry in enumerate(loop.carries) if carry in needed)
+    return sorted(sources - body)
 
 
 def _fused(graph: Graph, nodes: Collection[int], home: Mapping[int, int | None]) -> dict[int, int]:
@@ -110,12 +110,12 @@ def _fused(graph: Graph, nodes: Collection[int], home: Mapping[int, int | None])
     (A node is in a loop if it depends on the loop's carries, so this depends on the expression alone as well.) A sum
     whose arguments are the same node is not fused either, so that x - x is 0.
     """
-    found = {}
+    fused = {}
     for node in nodes:
         if graph.keys[node][0] in ("add", "sub"):
             first, second = graph.arguments(node)
-            for one in (second, first):
-                if graph.keys[one][0] == "mul" and home[one] == home[node] and first != second:
-                    found[node] = one
+            for argument in (second, first):
+                if graph.keys[argument][0] == "mul" and home[argument] == home[node] and first != second:
+                    fused[node] = argument
                     break
-    return found
+    return fused

@@ -78,11 +78,11 @@ def extreme_of(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
         if g.constant(b) is not None:
             a, b = b, a
         first = g.op("lt", b, a) if name == "max" else g.op("lt", a, b)
-        found = g.op("select", first, a, b)  # b if either is NaN: one instruction
+        selected = g.op("select", first, a, b)  # b if either is NaN: one instruction
         constant = g.constant(a)
         if constant is not None and not np.isnan(constant):
-            return found
-        return g.op("select", g.op("ne", a, a), a, found)
+            return selected
+        return g.op("select", g.op("ne", a, a), a, selected)
 
     return extreme
 
@@ -106,12 +106,12 @@ def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]
     """Arrays of the case that `which` names, element by element; numbers out of range name the first or last case."""
     g, is_bool, chosen = t.graph, graph_dtype(dtype) == "b", list(cases[-1])
 
-    def one(mask: int, early: int, late: int) -> int:
+    def choice(mask: int, early: int, late: int) -> int:
         return choose(g, mask, late, early) if is_bool else choose(g, mask, early, late)
 
     for number, case in reversed(list(enumerate(cases[:-1]))):
         mask = which if is_bool else t.map(lambda n, end=number + 1: g.op("slt", n, g.i(end)), which)
-        chosen = [t.map(one, mask, early, late) for early, late in zip(case, chosen, strict=True)]
+        chosen = [t.map(choice, mask, early, late) for early, late in zip(case, chosen, strict=True)]
     return chosen
 
 

@@ -63,13 +63,13 @@ def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
     for trip in order:
         outputs = t.closed(body, [*shared, *carry, *(row[trip] for row in rows)])
         carry = outputs[:carries]
-        for kept, one in zip(stacked, outputs[carries:], strict=True):
-            kept.append(one)
-    found = []
+        for kept, output in zip(stacked, outputs[carries:], strict=True):
+            kept.append(output)
+    results = []
     for kept, variable in zip(stacked, equation.outvars[carries:], strict=True):
         kept = kept[::-1] if params["reverse"] else kept
-        found.append(np.stack(kept) if kept else np.zeros(variable.aval.shape, np.int64))
-    return [*carry, *found]
+        results.append(np.stack(kept) if kept else np.zeros(variable.aval.shape, np.int64))
+    return [*carry, *results]
 
 
 def _counts(params: dict[str, Any]) -> tuple[int, int]:

@@ -24,13 +24,13 @@ def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule
         shape = tuple(x.shape[axis] for axis in kept)
         rows = np.transpose(x, [*kept, *axes]).reshape(int(np.prod(shape)), int(np.prod([x.shape[a] for a in axes])))
         function = combine(t, equation)
-        found = []
+        totals = []
         for row in rows.tolist():
             total = row[0] if row else _of_nothing(t, equation)
             for node in row[1:]:
                 total = function(total, node)
-            found.append(total)
-        return np.array(found, np.int64).reshape(shape)
+            totals.append(total)
+        return np.array(totals, np.int64).reshape(shape)
 
     return rule
 
@@ -86,15 +86,15 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         )
     goes_ahead = _beats(g, equation.primitive.name, dtype_in(equation))
     rows = np.moveaxis(x, axis, -1)
-    found = []
+    indices = []
     for row in rows.reshape(-1, x.shape[axis]).tolist():
         best, at = row[0], g.i(0)
         for number, node in enumerate(row[1:], 1):
             ahead = goes_ahead(node, best)
             best = choose(g, ahead, node, best)
             at = g.op("iselect", ahead, g.i(number), at)
-        found.append(at)
-    return np.array(found, np.int64).reshape(rows.shape[:-1])
+        indices.append(at)
+    return np.array(indices, np.int64).reshape(rows.shape[:-1])
 
 
 def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
@@ -123,10 +123,10 @@ def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Ru
         rows = rows[::-1] if equation.params["reverse"] else rows
         if not len(rows):
             return x
-        found = [rows[0]]
+        totals = [rows[0]]
         for row in rows[1:]:
-            found.append(t.map(function, found[-1], row))
-        stacked = np.stack(found[::-1] if equation.params["reverse"] else found)
+            totals.append(t.map(function, totals[-1], row))
+        stacked = np.stack(totals[::-1] if equation.params["reverse"] else totals)
         return np.moveaxis(stacked, 0, equation.params["axis"])
 
     return rule
@@ -154,12 +154,12 @@ def _dot_general(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
         np.transpose(x, (*first, *free, *last)).reshape(batch, int(np.prod([x.shape[axis] for axis in free])), inner)
         for x, first, free, last in ((a, batch_a, free_a, contract_a), (b, batch_b, free_b, contract_b))
     )
-    g, found = t.graph, []
+    g, totals = t.graph, []
     for left, right in zip(rows_a.tolist(), rows_b.tolist(), strict=True):
         for row in left:
             for column in right:
                 total = g.f(0.0)
                 for x, y in zip(row, column, strict=True):
                     total = g.op("add", total, g.op("mul", x, y))
-                found.append(total)
-    return np.array(found, np.int64).reshape(shape)
+                totals.append(total)
+    return np.array(totals, np.int64).reshape(shape)

@@ -36,7 +36,7 @@ def _same(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
 def _slice(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     starts, limits = equation.params["start_indices"], equation.params["limit_indices"]
     strides = equation.params["strides"] or [1] * len(starts)
-    return x[tuple(slice(*one) for one in zip(starts, limits, strides, strict=True))]
+    return x[tuple(slice(*bounds) for bounds in zip(starts, limits, strides, strict=True))]
 
 
 @primitive("transpose")
@@ -106,9 +106,9 @@ def _dynamic_slice(t: Tracer, equation: Any, x: Nodes, *starts: Nodes) -> Nodes:
 @primitive("dynamic_update_slice")
 def _dynamic_update_slice(t: Tracer, equation: Any, x: Nodes, update: Nodes, *starts: Nodes) -> Nodes:
     at = _dynamic_starts(t, equation, x, update.shape, starts, 2)
-    found = x.copy()
-    found[tuple(slice(start, start + size) for start, size in zip(at, update.shape, strict=True))] = update
-    return found
+    updated = x.copy()
+    updated[tuple(slice(start, start + size) for start, size in zip(at, update.shape, strict=True))] = update
+    return updated
 
 
 def _dynamic_starts(t: Tracer, equation: Any, x: Nodes, sizes: Any, starts: Any, first: int) -> list[int]:
@@ -131,14 +131,14 @@ def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
     batched = numbers.operand_batching_dims
     removed = (*numbers.collapsed_slice_dims, *batched)
     kept = [axis for axis in range(x.ndim) if axis not in removed]
-    found = np.empty([*batch_shape, *(sizes[axis] for axis in kept)], np.int64)
+    gathered = np.empty([*batch_shape, *(sizes[axis] for axis in kept)], np.int64)
     for place in np.ndindex(*batch_shape):
         batch = {axis: place[k] for axis, k in zip(batched, numbers.start_indices_batching_dims, strict=True)}
         corner = dict(zip(numbers.start_index_map, starts[place], strict=True)) | batch
         window = _window(x, corner, sizes, mode)
-        found[place] = _fill(t, equation) if window is None else x[window].reshape([sizes[axis] for axis in kept])
+        gathered[place] = _fill(t, equation) if window is None else x[window].reshape([sizes[axis] for axis in kept])
     order = [*batch_axes, *numbers.offset_dims]
-    return np.transpose(found, np.argsort(order)).reshape(out_shape)
+    return np.transpose(gathered, np.argsort(order)).reshape(out_shape)
 
 
 def _window(x: Nodes, corner: dict[int, int], sizes: Any, mode: Any) -> tuple[slice, ...] | None:
@@ -184,7 +184,7 @@ def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes)
     kept = [axis for axis in range(x.ndim) if axis not in removed]
     sizes = np.ones(x.ndim, np.int64)
     sizes[kept] = [updates.shape[axis] for axis in window_axes]
-    found = x.copy()
+    updated = x.copy()
     for place in np.ndindex(*starts.shape[:-1]):
         batch = {axis: place[k] for axis, k in zip(batched, numbers.scatter_indices_batching_dims, strict=True)}
         corner = dict(zip(numbers.scatter_dims_to_operand_dims, starts[place], strict=True)) | batch
@@ -192,5 +192,5 @@ def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes)
         if window is None:
             continue
         update = rows[place].reshape(sizes)
-        found[window] = update if name is None else t.ops(name, found[window], update)
-    return found
+        updated[window] = update if name is None else t.ops(name, updated[window], update)
+    return updated
