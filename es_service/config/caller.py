@@ -5,26 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
-from es_service.protocol.options import Option, OptionValue
+from es_service.protocol.options import Option, OptionValue, allowed_value
 from es_service.protocol.parameters import FREE, ParameterSpec
 
 CALLER = "caller"
 """Name of the task, and its kind."""
 OPTIONS = {
-    "observation_size": Option(0, low=0),
-    "action_size": Option(0, low=0),
-    "parameters": Option(0, low=0),
-    "descriptor_size": Option(2, low=1),
+    "observation_size": Option(0, low=0, high=1_000_000),
+    "action_size": Option(0, low=0, high=1_000_000),
+    "parameters": Option(0, low=0, high=10_000_000),
+    "descriptor_size": Option(2, low=1, high=1000),
     "episode_steps": Option(1, low=1),
 }
 """Either the sizes of a policy, or the number of parameters of something else; and the dimensions of the descriptor."""
 
 
 def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
-    """Description of the task with these options; those that are left out have their defaults."""
-    values = {name: option.default for name, option in OPTIONS.items()} | dict(options)
+    """Description of the task with these options; those that are left out or not allowed have their defaults."""
+    values = {name: allowed_value(option, options.get(name)) for name, option in OPTIONS.items()}
     observations, actions, parameters, dimensions, steps = (
-        value if isinstance(value := values[name], int) else 0 for name in OPTIONS
+        int(OPTIONS[name].default if value is None else value) for name, value in values.items()
     )
     names = tuple(f"p{index}" for index in range(parameters))
     return TaskSpec(

@@ -32,6 +32,8 @@ def _tuples(value: Any) -> Any:
 
 
 Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
+CountAtOnce = Annotated[int, Field(ge=1, le=2**24), f"a whole number from 1 to {2**24:,}"]
+"""Number of what a generation keeps in memory at the same time."""
 Rank = Annotated[int, Field(ge=1, le=MOST_RANK), f"a whole number from 1 to {MOST_RANK}"]
 Positive = Annotated[float, Field(gt=0), "a number above 0"]
 Patience = Annotated[float, Field(ge=20), "a number, at least 20"]

@@ -22,7 +22,7 @@ from es_service.config.methods import (
 from es_service.config.model import RunConfig
 from es_service.config.problems import nearest, one_of, problem_of
 from es_service.config.search import SearchConfig
-from es_service.config.yaml_text import in_line, parse_value, show
+from es_service.config.yaml_text import in_line, parse_value, plain, show
 from es_service.errors import Problem
 from es_service.protocol.policy_spec import PolicySpec
 
@@ -94,7 +94,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
             unusable.add(name)
             problems.append(problem_of(name, value, _not_a_mapping(name, value)))
         else:
-            values[name] = value
+            values[name] = plain(value)
     return values, unusable, problems
 
 
@@ -156,7 +156,7 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
     values: dict[str, Any] = {}
     problems: list[Problem] = []
     if isinstance(overrides, Mapping):
-        overrides = [f"{name}={in_line(value)}" for name, value in overrides.items()]
+        overrides = [f"{name}={in_line(plain(value))}" for name, value in overrides.items()]
     for override in [overrides] if isinstance(overrides, str) else overrides:
         name, equals, text = (part.strip() for part in override.partition("="))
         where = f"override {override}"

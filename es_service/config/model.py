@@ -223,6 +223,17 @@ def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
     return PolicySpec(widths, policy.activation, policy.output, policy.bias, policy.memory or 0)
 
 
+def require_episodes(task: TaskSpec, *, asks_caller: bool) -> None:
+    """Raise ConfigError if a task has no episodes of its own, and the caller is not asked for them."""
+    if task.kind == CALLER and not asks_caller:
+        raise ConfigError(
+            "the episodes of this run are those of the program that asks it, so the service can compute none; to "
+            "continue it, that program calls es_service.ask_tell with the same config and folder",
+            field="task.environment",
+            value=CALLER,
+        )
+
+
 def worker_spec(
     config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = (), *, asks_caller: bool = False
 ) -> WorkerSpec:
@@ -232,15 +243,9 @@ def worker_spec(
         outputs: see `WorkerSpec.outputs`; those that the search reads are added.
         asks_caller: whether the caller computes the episodes of a task that has none of its own.
 
-    Raises ConfigError if the task has no episodes of its own, and the caller is not asked for them.
+    Raises ConfigError as `require_episodes`.
     """
-    if task.kind == CALLER and not asks_caller:
-        raise ConfigError(
-            "the episodes of this run are those of the program that asks it (es_service.ask_tell), so the service can "
-            "compute none",
-            field="task.environment",
-            value=CALLER,
-        )
+    require_episodes(task, asks_caller=asks_caller)
     settings, policy, compute, search = config.task, config.policy, config.compute, config.search
     return WorkerSpec(
         seed=config.seed,

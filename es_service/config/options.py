@@ -11,7 +11,7 @@ from es_service.config.problems import nearest, one_of, problem_of, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
-from es_service.protocol.options import Option, OptionValue, is_within
+from es_service.protocol.options import Option, OptionValue, allowed_text, allowed_value
 
 
 class TaskTable(Mapping[str, TaskSpec]):
@@ -64,33 +64,14 @@ def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, O
             hint = f"; did you mean {meant}?" if meant else ""
             problems.append(problem_of(key, value, f"unknown option; {known}{hint}", suggestion=meant))
         elif (read := _read(declared[name], value)) is None:
-            problems.append(wrong_value(key, value, allowed_text(declared[name]), declared[name].choices))
+            problems.append(wrong_value(key, value, allowed_text(declared[name], show), declared[name].choices))
         else:
             options[key] = read
     return options, problems
 
 
-def allowed_text(option: Option) -> str:
-    """What an option allows, in words."""
-    if option.choices:
-        return one_of([show(value) for value in option.choices])
-    if isinstance(option.default, bool | str):
-        return "true or false" if isinstance(option.default, bool) else "text"
-    number = "a whole number" if isinstance(option.default, int) else "a number"
-    low, high = option.low, option.high
-    if low is not None and high is not None:
-        return f"{number} from {show(low)} to {show(high)}"
-    bounds = [f"at {word} {show(bound)}" for word, bound in (("least", low), ("most", high)) if bound is not None]
-    return ", ".join([number, *bounds])
-
-
 def _read(option: Option, value: Any) -> OptionValue | None:
     """A value of a config as a value of the option; None if it is not allowed."""
-    kind = type(option.default)
-    if kind is float and type(value) is int and abs(value) < 2**1000:
-        value = float(value)
-    if kind is str and option.choices and type(value) in (bool, int, float):
+    if isinstance(option.default, str) and option.choices and type(value) in (bool, int, float):
         value = in_line(value)  # YAML reads a choice such as 10 as a number
-    if type(value) is not kind or (option.choices and value not in option.choices):
-        return None
-    return value if is_within(option, value) else None
+    return allowed_value(option, value)

@@ -12,7 +12,8 @@ import os
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from es_service.config.fields import RESOURCES
+from es_service.config.caller import CALLER
+from es_service.config.fields import RESOURCES, TASK_OPTIONS
 from es_service.config.keys import FIELDS, policy_of
 from es_service.config.map_rules import default_bounds, default_cells, default_kind, default_qd_offset
 from es_service.config.methods import default_centres
@@ -197,6 +198,11 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if (noise := values.get("search.noise.kind", "full")) != "full" and task.parameters is not None:
         why = f" for {task.name}, whose parameters are no matrices"
         problems.append(not_allowed("search.noise.kind", noise, "full", why=why))
+    if task.kind == CALLER and task.parameters is None:
+        sizes = (values.get(f"{TASK_OPTIONS}{name}") for name in ("observation_size", "action_size"))
+        if 0 in sizes:
+            what = "the caller's episodes have no size; set it, or task.options.observation_size and action_size"
+            problems.append(problem_of(f"{TASK_OPTIONS}parameters", 0, what, allowed="at least 1"))
     return problems
 
 

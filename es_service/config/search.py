@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Share, Switch, Text
+from es_service.config.fields import Count, CountAtOnce, Fraction, NotNegative, Positive, Section, Share, Switch, Text
 from es_service.config.parts import (
     AdamStep,
     FitnessObjective,
@@ -34,11 +34,11 @@ class SearchConfig(Section):
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
-    centres: Count = Field(
+    centres: CountAtOnce = Field(
         description="Number of centres searched side by side, each with its own optimiser. auto: as many as the method "
         "usually has, 1 for a search of your own."
     )
-    evaluation_episodes: Count = Field(
+    evaluation_episodes: CountAtOnce = Field(
         30, description="Noise-free episodes on which each new centre is evaluated; they count as environment steps."
     )
     max_invalid_fraction: Fraction = Field(
@@ -103,7 +103,7 @@ class SearchConfig(Section):
 class PopulationConfig(SearchConfig):
     """A search that perturbs centres with pairs of noise and moves them along gradient estimates."""
 
-    pairs: Count = Field(
+    pairs: CountAtOnce = Field(
         description="Antithetic pairs of a population, which has twice as many members. A generation has one "
         "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
@@ -163,7 +163,7 @@ class PopulationConfig(SearchConfig):
 class CandidatesConfig(PopulationConfig):
     """A search that starts from several policies of another run: its best centre, and elites of its map."""
 
-    screened: Count = Field(
+    screened: CountAtOnce = Field(
         16,
         description="Policies of the run that search.init_from names, from which the search starts: the best centre "
         "and elites. Their first evaluation chooses search.candidates of them.",

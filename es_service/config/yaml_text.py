@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.constructor import ConstructorError, DuplicateKeyError, SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -133,6 +134,13 @@ def split_values(text: str) -> list[str]:
 def dump_yaml(value: object) -> str:
     """Text that reads back as the same value: keys in their own order, lists on one line."""
     return _dump(value, flow=False, width=120)
+
+
+def plain(value: Any) -> Any:
+    """A value with Python's numbers and lists in place of those of NumPy, which a grid of settings often has."""
+    if isinstance(value, list) and any(isinstance(item, np.generic) for item in value):
+        return [item.tolist() if isinstance(item, np.generic) else item for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def in_line(value: object) -> str:

@@ -11,7 +11,7 @@ They are the attribute `options` of the task's class. A config sets them below `
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +64,32 @@ def _problem(name: object, option: object) -> str:
     if not all(is_within(option, value) for value in values):
         return f"= {option!r} has a number outside its bounds, or one that is not finite"
     return ""
+
+
+def allowed_value(option: Option, value: object) -> OptionValue | None:
+    """A given value as a value of an option, a whole number also where the option has other numbers; None if it is not
+    allowed."""
+    kind = type(option.default)
+    if kind is float and type(value) is int and abs(value) < 2**1000:
+        value = float(value)
+    if not isinstance(value, bool | int | float | str) or type(value) is not kind:
+        return None
+    return value if (not option.choices or value in option.choices) and is_within(option, value) else None
+
+
+def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = repr) -> str:
+    """What an option allows, in words; `show` writes a value."""
+    if option.choices:
+        *first, last = map(show, option.choices)
+        return f"{', '.join(first)} or {last}" if first else last
+    if isinstance(option.default, bool | str):
+        return "true or false" if isinstance(option.default, bool) else "text"
+    number = "a whole number" if isinstance(option.default, int) else "a number"
+    low, high = option.low, option.high
+    if low is not None and high is not None:
+        return f"{number} from {show(low)} to {show(high)}"
+    bounds = [f"at {word} {show(bound)}" for word, bound in (("least", low), ("most", high)) if bound is not None]
+    return ", ".join([number, *bounds])
 
 
 def is_within(option: Option, value: OptionValue) -> bool:

@@ -15,7 +15,7 @@ from es_service.config.search import SearchConfig
 from es_service.config.tasks import ROLLOUTS
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import UNBOUNDED, TaskSpec
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.settings import UndeclaredSettings
 
@@ -65,6 +65,8 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
         "search": {"algorithm": algorithm, "preset": values.get(PRESET, "literature")},
         "budget": config["budget"],
     }
+    if UNBOUNDED in task.descriptor_bounds and values.get("map.enabled"):
+        least["map"] = {"bounds": values["map.bounds"]}  # which have no default
     method = OURS.get(algorithm, _Keys(UndeclaredSettings))  # a search of the user is not imported
     unknown = {key for key in values if key.startswith("search.") and ":" in algorithm} - search_fields(
         method.settings

@@ -120,7 +120,7 @@ def write_compared(
 
 def write_page(page: str, file: Path, ways_out: Sequence[WayOut] = ()) -> Path:
     """Write a page so that a reader never sees half of it. Raises StoreError, with the ways out, if this fails."""
-    half = file.with_name(f".{file.name}.{os.getpid()}")
+    half = file.parent / f".{file.name}.{os.getpid()}"
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         # A folder's name may be no UTF-8; then it is shown with question marks.

@@ -94,7 +94,7 @@ def certify_run(
         ConfigError: a number is wrong, or the task does not have what `by` names. EvaluationError: the rollouts cannot
         continue. Interrupted: SIGINT or SIGTERM arrived. Then nothing is stored.
     """
-    for name, value, least in (("episodes", episodes, 1), ("keep", keep, 1), ("top", top or 0, 0)):
+    for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("top", top or 0, 0)):
         whole(name, value, least)
     run = open_run(folder)
     with RunStore.open(run.folder) as store:
@@ -150,7 +150,7 @@ def certify(
     Raises:
         ConfigError: an argument is wrong. Otherwise as `certify_run`.
     """
-    for name, value, least in (("episodes", episodes, 1), ("keep", keep, 1), ("number", number, 0)):
+    for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("number", number, 0)):
         whole(name, value, least)
     config = evaluating_config(config, workers, "inline", None)
     _measure(config, by)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from es_service.config.keys import Overrides
+from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.config.parts import TargetObjective
 from es_service.config.search import CandidatesConfig
@@ -17,6 +17,8 @@ from es_service.runs.checked_config import load_config
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 
+LIMITS = ("generations", "env_steps", "wall_clock_s")
+"""Limits of a budget that are reached in any case."""
 METHOD = next(name for name, method in ALGORITHMS.items() if issubclass(method.settings, CandidatesConfig))
 """The method that starts from several policies of another run."""
 
@@ -24,8 +26,8 @@ METHOD = next(name for name, method in ALGORITHMS.items() if issubclass(method.s
 def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> RunConfig:
     """The config of a run that polishes policies of another one.
 
-    It has the task, the policy and the map of that run, its number of environment steps so far as its budget, and
-    defaults for everything else.
+    It has the task, the policy and the map of that run, defaults for everything else, and unless `overrides` set a
+    limit, the number of environment steps of that run as its budget.
 
     Args:
         parent: folder of the other run.
@@ -41,7 +43,10 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
     sections = {name: present[name] for name in ("task", "policy", "map", "seed")}
     steps = int(run.history_rows(run.generation)[-1]["env_steps"])
     search = {"algorithm": METHOD, "init_from": str(run.folder)}
-    return load_config({**sections, "search": search, "budget": {"env_steps": steps}}, overrides)
+    overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
+    is_limited = any(parse_overrides(overrides)[0].get(f"budget.{name}") is not None for name in LIMITS)
+    budget = {} if is_limited else {"env_steps": steps}
+    return load_config({**sections, "search": search, "budget": budget}, overrides)
 
 
 def certify_both(

@@ -12,7 +12,7 @@ from typing import Any
 from uuid import uuid4
 
 from es_service.config.changes import again_with
-from es_service.config.model import RunConfig
+from es_service.config.model import RunConfig, require_episodes
 from es_service.config.tasks import task_of
 from es_service.dispatch import dispatch_log
 from es_service.errors import StartError, WayOut
@@ -58,6 +58,7 @@ def create_run(
     """
     require_cores(config, again)
     is_new, task = not folder.exists(), task_of(accepted(config))
+    require_episodes(task, asks_caller=listener.caller is not None)
     history, evaluations = columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
@@ -135,6 +136,7 @@ def _session(
             listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
+        require_episodes(task_of(config), asks_caller=listener.caller is not None)
         require_resumable(store, config, asked, strict=strict)
         try:
             write_config(folder, config.resolved_yaml())

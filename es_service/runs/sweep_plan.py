@@ -13,7 +13,7 @@ from typing import Any
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
-from es_service.config.yaml_text import in_line, show
+from es_service.config.yaml_text import in_line, plain, show
 from es_service.errors import ConfigError, Problem, StoreError
 from es_service.runs.checked_config import changes_from, load_config
 from es_service.runs.view import open_run
@@ -64,8 +64,8 @@ def plan(
     if here and holds_run(out):
         raise ConfigError(f"{out} is the folder of a run; choose another folder for the sweep", field="out", run=out)
     common, problems = parse_overrides(overrides)
-    by_seed = {} if seeds is None else {SEED: list(seeds)}
-    axes = {key: list(values) for key, values in grid.items()} | by_seed
+    by_seed = {} if seeds is None else {SEED: plain(list(seeds))}
+    axes = {key: plain(list(values)) for key, values in grid.items()} | by_seed
     problems += _axis_problems(axes, SEED in grid, common)
     if problems:
         raise _refused(source, problems)

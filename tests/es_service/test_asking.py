@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from es_service import api, ask_tell
+from es_service import api, ask_tell, fork, load_config, resume
 from es_service.asking import Asked
 from es_service.cli.main import app
+from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, EvaluationError
+from es_service.report.settings import changed_settings
+from es_service.runs.polishing import polish_config
 from es_service.store.digest import digest_parts
 from tests.examples import late_answers, own_loop
 from tests.workers.host_tasks import CornerMaze
@@ -181,6 +184,44 @@ def test_readers_know_the_run_and_whoever_would_compute_episodes_says_whose_they
         assert done.exit_code, words
         said = " ".join(str(done.exception or done.output).split())
         assert "the episodes of this run are those of the program that asks it" in said, (words, said)
+
+
+def test_a_call_that_is_refused_since_the_episodes_are_the_caller_s_leaves_everything_as_it_was(tmp_path):
+    run = finished(config_of(), tmp_path / "run")
+    before = run.digest(), (run.folder / "config.yaml").read_text()
+    calls = (
+        lambda: resume(run.folder, {"budget.generations": 50}),
+        lambda: fork(run.folder, {"budget.generations": 50}, out=tmp_path / "new"),
+        lambda: api.run(config_of(), tmp_path / "new"),
+        lambda: api.run(polish_config(run.folder), tmp_path / "new"),
+    )
+    for call in calls:
+        with pytest.raises(ConfigError, match=r"that program calls es_service\.ask_tell"):
+            call()
+        assert not (tmp_path / "new").exists()
+        assert (run.digest(), (run.folder / "config.yaml").read_text()) == before
+
+
+def test_a_report_shows_the_settings_of_a_run_whose_bounds_have_no_default(tmp_path):
+    run = finished(config_of("es"), tmp_path / "run")
+    keys = {setting.key for setting in changed_settings(run.meta.config, task_of(load_config(run.meta.config)))}
+    assert {"map.cells", "search.sigma", "task.options.parameters"} <= keys
+    assert not any(key.startswith("compute.") for key in keys)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({}, "task.options.parameters"),
+        ({"observation_size": 3}, "task.options.parameters"),
+        ({"parameters": 10**10}, "task.options.parameters"),
+        ({"parameters": 3, "descriptor_size": 10**9}, "task.options.descriptor_size"),
+    ],
+)
+def test_episodes_without_a_size_or_with_too_large_a_one_are_refused(options, field):
+    with pytest.raises(ConfigError) as caught:
+        load_config(config_of(task={"environment": "caller", "options": options}))
+    assert {problem.field for problem in caught.value.problems} == {field}
 
 
 @pytest.mark.slow

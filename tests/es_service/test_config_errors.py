@@ -37,11 +37,12 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("search.pairs='512'", "'512' ... must be a whole number, at least 1; remove the quotes"),
-        ("search.pairs=512.5", "512.5 ... must be a whole number, at least 1"),
-        ("search.pairs=0", "0 ... must be a whole number, at least 1"),
+        ("search.pairs='512'", "'512' ... must be a whole number from 1 to 16,777,216; remove the quotes"),
+        ("search.pairs=512.5", "512.5 ... must be a whole number from 1 to 16,777,216"),
+        ("search.pairs=0", "0 ... must be a whole number from 1 to 16,777,216"),
+        ("search.pairs=1_000_000_000_000", "1000000000000 ... must be a whole number from 1 to 16,777,216"),
         ("search.pairs=true", "true ... must be a whole number"),
-        ("search.pairs=null", "null ... must be a whole number, at least 1; leave the key out"),
+        ("search.pairs=null", "null ... must be a whole number from 1 to 16,777,216; leave the key out"),
         ("budget.env_steps=1e6", "1000000.0 ... must be a whole number, at least 1 or null; write 1000000"),
         ("seed=true", "true ... must be a whole number, at least 0 and below 2**63"),
         ("seed=-1", "-1 ... must be a whole number, at least 0 and below 2**63"),

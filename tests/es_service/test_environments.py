@@ -284,6 +284,9 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
         ),
         (lambda: many("brax:aunt"), TaskError, "did you mean brax:ant"),
         (lambda: many(task_options={"begin": 1}), TaskError, "no option 'begin'; its options: start"),
+        (lambda: many(task_options={"start": "Corner"}), TaskError, "start = 'Corner' is not allowed; must be"),
+        (lambda: many(task_options={"start": 3}), TaskError, "start = 3 is not allowed; must be 'default' or"),
+        (lambda: many(task_options=5), TaskError, "task_options = 5 is no mapping"),
         (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
         (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
         (

@@ -8,11 +8,10 @@ from dataclasses import asdict, replace
 import pytest
 
 from es_service.config.loading import changed_config, load_config
-from es_service.config.options import allowed_text
 from es_service.config.tasks import task_from_fields
-from es_service.config.yaml_text import parse_value
+from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError
-from es_service.protocol.options import Option, choice, declared_options
+from es_service.protocol.options import Option, allowed_text, choice, declared_options
 from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, POINT_MAZE
 from workers.rollouts import BACKENDS
@@ -105,7 +104,7 @@ def test_a_choice_that_yaml_reads_as_another_type_may_be_written_plainly():
     ],
 )
 def test_bounds_are_said_in_words(option, text):
-    assert allowed_text(option) == text
+    assert allowed_text(option, show) == text
 
 
 @pytest.mark.parametrize(

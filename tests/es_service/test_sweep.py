@@ -5,6 +5,7 @@ Sweeps themselves are in `tests/system/test_sweep.py`.
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,6 +39,13 @@ def test_every_combination_and_seed_is_a_run_in_a_folder_named_after_it(tmp_path
         assert run.name.endswith(f"_seed={run.config.seed}")
         assert (run.config.search.pairs, run.config.map.cells) == (64, (20, 20))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_grid_and_seeds_of_numpy_are_those_of_python(tmp_path):
+    grid = {"search.sigma": [0.05, 0.1], "search.pairs": [64, 128]}
+    of_numpy = {key: np.array(values) for key, values in grid.items()}
+    assert plan(MINIMAL, tmp_path, of_numpy, np.arange(2)) == plan(MINIMAL, tmp_path, grid, range(2))
+    assert load_config(MINIMAL, {"search.pairs": np.int64(16)}) == load_config(MINIMAL, ["search.pairs=16"])
 
 
 def test_a_larger_sweep_has_the_runs_of_the_smaller_one(tmp_path):

@@ -160,6 +160,11 @@ def test_the_command_polishes_a_run_and_shows_certified_values_before_and_after(
     assert run.config["budget"]["env_steps"] == parent.history["env_steps"].iloc[-1]
 
 
+def test_a_budget_that_is_given_takes_the_place_of_the_other_run_s_steps(parent):
+    assert polish_config(parent.folder, {"budget.generations": 3}).budget.env_steps is None
+    assert polish_config(parent.folder, ["budget.target_fitness=3"]).budget.env_steps is not None
+
+
 def test_with_a_target_set_policies_are_selected_by_success(parent, tmp_path):
     target = {"kind": "target", "descriptor": [-0.5, 0.8], "radius": 0.1}
     config = polish_config(parent.folder, {f"search.objective.{key}": value for key, value in target.items()})

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.options import OptionValue
+from es_service.protocol.options import OptionValue, allowed_text, allowed_value
 from workers.environments import SHIPPED, TaskError, describe_environment, is_function_task, is_host_task
 from workers.lanes.blocks import BLOCK, Blocks
 from workers.lanes.compiled import CompiledLanes, compiled_resets, kernels
@@ -49,10 +49,22 @@ def task_named(name: str, options: Mapping[str, OptionValue]) -> TaskSpec:
     if is_function_task(name):
         raise TaskError(f"task = {name!r} is a function of parameters, which has no steps")
     task = SHIPPED[name] if name in SHIPPED else describe_environment(name)
-    if unknown := sorted({*options} - {*task.options}):
-        known = ", ".join(task.options) or "none"
-        raise TaskError(f"task_options: {name} has no option {unknown[0]!r}; its options: {known}")
-    return with_options(task, options)
+    return with_options(task, options_of(task, options))
+
+
+def options_of(task: TaskSpec, given: Mapping[str, OptionValue]) -> dict[str, OptionValue]:
+    """Value of every option of a task. Raises TaskError if the task has no such option, or a value is not allowed."""
+    if not isinstance(given, Mapping):
+        raise TaskError(f"task_options = {given!r} is no mapping from names of options to their values")
+    options = {name: option.default for name, option in task.options.items()}
+    for name, value in given.items():
+        if (option := task.options.get(name)) is None:
+            known = ", ".join(task.options) or "none"
+            raise TaskError(f"task_options: {task.name} has no option {name!r}; its options: {known}")
+        if (allowed := allowed_value(option, value)) is None:
+            raise TaskError(f"task_options: {name} = {value!r} is not allowed; must be {allowed_text(option)}")
+        options[name] = allowed
+    return options
 
 
 class Lanes:
@@ -75,7 +87,7 @@ class Lanes:
             TaskError: as `task_named`, or the task cannot be computed.
         """
         self.task = task_named(name, options)
-        chosen = {key: option.default for key, option in self.task.options.items()} | dict(options)
+        chosen = options_of(self.task, options)
         begin, step, lacks = kernels(name, tuple(sorted(chosen.items())), self.task.action_size)
         if lacks:
             _say_once(name, lacks, whole=step is None)

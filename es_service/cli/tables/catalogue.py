@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-from es_service.config.options import allowed_text
 from es_service.config.presets import PRESETS, preset_table
 from es_service.config.shipped import shipped_configs
 from es_service.config.yaml_text import show
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.options import Option
+from es_service.protocol.options import Option, allowed_text
 from es_service.search.algorithms import ALGORITHMS
 
 
@@ -72,7 +71,7 @@ def _option(option: Option) -> str:
     """What a config may set, the default first."""
     if option.choices:
         return " | ".join(map(show, option.choices))
-    return f"{show(option.default)} ({allowed_text(option)})"
+    return f"{show(option.default)} ({allowed_text(option, show)})"
 
 
 def _value(value: object) -> str:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, Positive
+from es_service.config.fields import Count, CountAtOnce, Fraction, Positive
 from es_service.config.model import RunConfig
 from es_service.config.parts import FitnessObjective, NearnessObjective
 from es_service.config.presets import same
@@ -59,7 +59,7 @@ The time of a fit grows with the cube of this."""
 class JediSettings(PopulationConfig):
     """Emitters, their targets, and the model of the map."""
 
-    emitters: Count = Field(4, description="Number of evolution strategies side by side, each with a target.")
+    emitters: CountAtOnce = Field(4, description="Number of evolution strategies side by side, each with a target.")
     target_generations: Count = Field(100, description="Generations after which each emitter gets a new target.")
     target_weight_start: Fraction = Field(
         1.0, description="Weight of nearness to the target beside fitness in the first generation of a target."

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import Count, NotNegative
+from es_service.config.fields import CountAtOnce, NotNegative
 from es_service.config.model import RunConfig
 from es_service.config.parts import Elites, MeasuredNewcomers, Once
 from es_service.config.presets import same
@@ -56,7 +56,7 @@ class MapElitesSettings(SearchConfig):
     """Policies and their variation. The map begins with 32 random policies unless the config has another number, which
     is our own choice: the store keeps all of them, and for an ant each takes a megabyte."""
 
-    batch: Count = Field(
+    batch: CountAtOnce = Field(
         256,
         description="Number of policies that a generation makes and evaluates; with other search.elites than once, the "
         "number of its samples.",

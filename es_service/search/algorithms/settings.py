@@ -6,7 +6,7 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
-from es_service.config.fields import Count
+from es_service.config.fields import CountAtOnce
 from es_service.config.model import RunConfig
 from es_service.config.parts import ElitesOfCentres, Objectives, Once, outputs_of
 from es_service.config.search import PopulationConfig, SearchConfig
@@ -87,7 +87,7 @@ class UndeclaredSettings(CentresSettings):
 class EmittersSettings(PopulationConfig):
     """Keys of methods with one centre for each of several emitters, which start from elites of the map."""
 
-    emitters: Count = Field(
+    emitters: CountAtOnce = Field(
         1, description="Number of evolution strategies side by side, with search.pairs pairs each in every generation."
     )
     mode: Literal["explore_exploit", "explore", "exploit"] = Field(
