@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.config.yaml_text import read_yaml_file
-from es_service.errors import NotInRunError, WayOut
+from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, elite_part
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
@@ -214,21 +214,23 @@ class Run:
         "certified" is the policy that the newest certification of the run has put first.
 
         Raises NotInRunError for "certified" if the run has no certification, for a cell that does not exist or is
-        empty, and for "centre" if the newest generation evaluated only policies, as those of map_elites do; ValueError
+        empty, and for "centre" if the newest generation evaluated only policies, as those of map_elites do; ConfigError
         for another name.
         """
-        if which == "best":
+        name = which if isinstance(which, str) else None  # a place may be an array
+        if name == "best":
             return self.at(wanted=lambda part: part == BEST).policy("best")
-        if which == "centre":
+        if name == "centre":
             return self.at(wanted=is_no_elite).policy("centre")
-        if which == "certified":
+        if name == "certified":
             policy = newest_certified(self.folder)
             if policy is None:
                 way_out = WayOut("certify", "certify one", str(self.folder))
                 raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])
             return make_policy(self.meta, policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
         if isinstance(which, str):
-            raise ValueError(f"policy({which!r}): choose 'best', 'centre', 'certified', or a cell such as (3, 17)")
+            allowed = "'best', 'centre', 'certified', or a cell such as (3, 17)"
+            raise ConfigError(f"policy({which!r}): choose {allowed}", field="which", value=which, allowed=allowed)
         elite = self.elite(which)
         return make_policy(self.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
 
