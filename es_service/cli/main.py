@@ -196,7 +196,7 @@ def main() -> None:
     except Interrupted:
         raise
     except MemoryError as error:
-        print_error(f"not enough memory: {error}. Reduce policy.hidden or search.pairs.")
+        print_error(f"not enough memory{f': {error}' if str(error) else ''}. Reduce policy.hidden or search.pairs.")
         sys.exit(1)
     except Exception as error:
         if (told := told_to_user(error)) is None:

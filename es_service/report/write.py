@@ -20,11 +20,11 @@ AnyPath = str | os.PathLike[str]
 
 
 def python_call(folder: Path) -> Evaluate:
-    """The Python call that gives a policy of a run."""
+    """The Python call that evaluates a policy of a run in new episodes."""
 
     def call(name: str) -> str:
-        place = repr(name) if name in ("best", "centre") else f"({name})" if "," in name else name
-        return f"open_run({str(folder)!r}).policy({place})"
+        candidate = {"best": "", "centre": "best=False, centre=True, "}.get(name, f"best=False, cells=[[{name}]], ")
+        return f"certify_run({str(folder)!r}, {candidate}top=0)"
 
     return call
 
