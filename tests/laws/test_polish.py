@@ -157,12 +157,14 @@ def test_the_command_polishes_a_run_and_shows_certified_values_before_and_after(
     assert run.config["task"] == parent.config["task"]
     assert run.config["policy"] == parent.config["policy"]
     assert run.config["map"] == parent.config["map"]
-    assert run.config["budget"]["env_steps"] == parent.history["env_steps"].iloc[-1]
+    assert (run.generation, run.config["budget"]["env_steps"]) == (3, None)
 
 
-def test_a_budget_that_is_given_takes_the_place_of_the_other_run_s_steps(parent):
+def test_the_budget_is_the_other_run_s_steps_unless_a_limit_is_given(parent):
+    steps = parent.history["env_steps"].iloc[-1]
+    assert polish_config(parent.folder).budget.env_steps == steps
+    assert polish_config(parent.folder, ["budget.target_fitness=3"]).budget.env_steps == steps
     assert polish_config(parent.folder, {"budget.generations": 3}).budget.env_steps is None
-    assert polish_config(parent.folder, ["budget.target_fitness=3"]).budget.env_steps is not None
 
 
 def test_with_a_target_set_policies_are_selected_by_success(parent, tmp_path):
