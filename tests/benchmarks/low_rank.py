@@ -3,7 +3,9 @@
     python -m tests.benchmarks.low_rank                          # two minutes, one core
 
 For each task and network, training chunks of 16 pairs and 50 steps and gradient blocks of 64 pairs, with noise of full
-rank and of ranks 1 and 4 by turns. Seconds are those of the processor.
+rank and of ranks 1 and 4 by turns. Seconds are those of the processor. `low_rank_ant.yaml` is a search with such noise:
+
+    es-service run tests/benchmarks/low_rank_ant.yaml --seed 0 --workers 1 [--set search.noise.kind=full]
 """
 
 from __future__ import annotations
