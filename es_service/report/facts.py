@@ -132,15 +132,15 @@ def faults(data: RunData) -> list[Fault]:
     ]
 
 
-def fault_sentence(found: list[Fault]) -> str:
+def fault_sentence(faults: list[Fault]) -> str:
     """The faults of a run in one sentence."""
-    if not found:
+    if not faults:
         return "No worker was lost and no chunk had to be sent again."
-    lost, retries = sum(fault.lost_workers for fault in found), sum(fault.retries for fault in found)
+    lost, retries = sum(fault.lost_workers for fault in faults), sum(fault.retries for fault in faults)
     were, sent = ("was" if total == 1 else "were" for total in (lost, retries))
     return (
         f"{count(lost, 'worker')} {were} lost and replaced, and {count(retries, 'chunk')} {sent} sent again, in "
-        f"{count(len(found), 'generation')}. No result depends on it."
+        f"{count(len(faults), 'generation')}. No result depends on it."
     )
 
 

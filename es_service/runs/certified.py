@@ -145,10 +145,10 @@ _FACTS = (
 )
 
 
-def stored(one: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """(facts, arrays) of a certified policy, as they are stored."""
-    facts = {name: getattr(one, name) for name in _FACTS}
-    return facts, {name: getattr(one, name) for name in _POLICY} | arrays_of(one.episodes)
+    facts = {name: getattr(policy, name) for name in _FACTS}
+    return facts, {name: getattr(policy, name) for name in _POLICY} | arrays_of(policy.episodes)
 
 
 def _from_row(row: CertifiedRow) -> Certified:

@@ -117,9 +117,9 @@ def _short(value: float | None) -> str:
     return "" if value is None or not math.isfinite(value) else short(value)
 
 
-def draw_run(runs: Runs, found: Found, reading: Reading) -> Callable[[], Picture | None]:
+def draw_run(runs: Runs, run: Found, reading: Reading) -> Callable[[], Picture | None]:
     """What draws one run; what was seen of it remains if it is moved or deleted."""
-    last, told = Picture(found.name, {}, {}), ""
+    last, told = Picture(run.name, {}, {}), ""
 
     def draw() -> Picture | None:
         nonlocal last, told
@@ -127,7 +127,7 @@ def draw_run(runs: Runs, found: Found, reading: Reading) -> Callable[[], Picture
             if not reading.update() and not told:
                 return None
         except ServiceError as error:
-            other = None if reading.data is None else runs.moved(reading.data.meta.run_id, found)
+            other = None if reading.data is None else runs.moved(reading.data.meta.run_id, run)
             before, told = told, f"{error.sentence} {other}"
             where = () if other is None else (" It is now ", tag("a", other.name, href=f"/run/{other.key}"), ".")
             others = {id_: html for id_, html in last.sections.items() if id_ != "live"}

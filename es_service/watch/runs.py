@@ -130,13 +130,13 @@ def seen_of(folder: Path) -> Mapping[str, Any]:
     return files | {LOCK: lock_holder(folder)}
 
 
-def require_inside(found: Found) -> None:
+def require_inside(run: Found) -> None:
     """Raise StoreError if the folder of a run, or one of its files, is a link out of the folder that was given."""
-    root = found.root.resolve()
+    root = run.root.resolve()
     for name in ("", *FILES):
-        if not (found.folder / name).resolve().is_relative_to(root):
-            what = f"{found.folder / name} is a link that leads out of {found.root}; it is not followed"
-            raise StoreError(what, run=found.folder)
+        if not (run.folder / name).resolve().is_relative_to(root):
+            what = f"{run.folder / name} is a link that leads out of {run.root}; it is not followed"
+            raise StoreError(what, run=run.folder)
 
 
 def _summary(run: Found) -> Summary:

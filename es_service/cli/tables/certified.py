@@ -11,9 +11,9 @@ from es_service.cli.console import print_line
 from es_service.runs.certified import Certified
 
 
-def print_certified(console: Console, found: list[Certified]) -> None:
+def print_certified(console: Console, certified: list[Certified]) -> None:
     """Print a line for each policy of a certification."""
-    for policy in found:
+    for policy in certified:
         print_line(console, f"  {policy.name:<10} {certified_line(policy.row())}")
 
 
