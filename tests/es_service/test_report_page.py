@@ -217,6 +217,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence_with_the_way_out(tmp_pat
     folder = write_run(tmp_path / "run")
     for file, why in (
         (folder / "config.yaml" / "page.html", "File exists"),
+        (Path(), "(Is a directory|Device or resource busy)"),
         (Path("/proc/page.html"), "No such file or directory"),
         (Path("/sys/page.html"), "(Permission denied|Read-only file system)"),
     ):

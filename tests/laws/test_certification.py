@@ -19,6 +19,7 @@ from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, stream_keys
+from es_service.report.write import python_call
 from es_service.runs import certification
 from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, outputs_of
 from es_service.runs.certified import certified_policies
@@ -288,7 +289,7 @@ def test_there_must_be_something_to_certify(finished):
     assert len(run.certified) == 4
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"keep": 0}, {"top": -1}, {"keep": 1.5}, {"by": "luck"}])
+@pytest.mark.parametrize("wrong", [{"episodes": 1}, {"keep": 0}, {"top": -1}, {"keep": 1.5}, {"by": "luck"}])
 def test_wrong_numbers_are_refused_before_anything_runs(finished, monkeypatch, wrong):
     run, _ = finished
     monkeypatch.delattr(certification, "workers_of")
@@ -299,6 +300,24 @@ def test_wrong_numbers_are_refused_before_anything_runs(finished, monkeypatch, w
 def test_wrong_arguments_are_named():
     with pytest.raises(ConfigError, match="parameters has the shape"):
         certify(np.zeros((3, 2)), CONFIG)
+
+
+def test_a_policy_has_a_name_or_a_place_that_may_be_an_array(finished):
+    run, _ = finished
+    place = run.map[["cell_x", "cell_y"]].to_numpy()[0]
+    np.testing.assert_array_equal(run.policy(place).parameters_D, run.policy(tuple(place.tolist())).parameters_D)
+    with pytest.raises(ConfigError, match=r"policy\('fittest'\): choose 'best'"):
+        run.policy("fittest")
+
+
+def test_the_call_in_a_page_that_python_writes_certifies_that_policy(tmp_path):
+    run = api.run(CONFIG, tmp_path / "run", progress=False).run
+    x, y = run.map[["cell_x", "cell_y"]].iloc[0]
+    call = python_call(run.folder)
+    names = ["best", "centre", f"{x},{y}"]
+    for name in names if run.at().newest_centre is not None else [names[0], names[2]]:
+        [policy] = eval(call(name).replace("top=0", "top=0, episodes=2"))
+        assert policy.name == name
 
 
 def test_intervals_are_those_of_the_tables():
