@@ -72,7 +72,7 @@ def test_every_problem_of_a_config_is_there_as_data():
         api.load_config(SMALL, wrong)
     found = {problem.field: problem for problem in caught.value.problems}
     assert found.keys() == wrong.keys()
-    assert (found["search.pairs"].value, found["search.pairs"].allowed) == (0, "a whole number, at least 1")
+    assert (found["search.pairs"].value, found["search.pairs"].allowed) == (0, "a whole number from 1 to 16,777,216")
     assert (found["task.fitness"].allowed, found["task.fitness"].suggestion) == ("sum or final", "final")
     assert found["search.sgma"].suggestion == "search.sigma"
     first = caught.value.problems[0]
