@@ -40,8 +40,8 @@ def cases() -> list[dict[str, Any]]:
 
     sizes = {
         "ant_maze": (8192, 128, 1024, 32768, 131072),
-        "ant_trap": (8192, 1024, 32768),
-        "brax:ant": (8192, 32768),
+        "ant_trap": (8192, 128, 1024, 32768, 131072),
+        "brax:ant": (8192, 128, 1024, 32768, 131072),
         "point_maze": (128, 1024, 8192, 32768, 131072),
     }
     curve = [
@@ -50,12 +50,14 @@ def cases() -> list[dict[str, Any]]:
         for members in several
     ]
     again = [case("ant_trap", 1024, 100)]  # two processes must have the same bits
-    returns = [case(task, 4096, 250, keep_returns=True) for task in ("ant_maze", "ant_trap")]
+    kept = {"ant_maze": 250, "ant_trap": 250, "point_maze": 200}
+    returns = [case(task, 4096, steps, keep_returns=True) for task, steps in kept.items()]
+    low_rank = [case("ant_maze", 8192, 100, noise={"kind": "low_rank", "rank": 1})]
     ways = [case("ant_maze", 8192, 100, way, keep_program=way == "members") for way in WAYS]
     physics = [case("ant_maze", 8192, 100, "members") | {"hidden": []}]
     flags = [case("ant_maze", 8192, 100, flags=name) for name in ("no_graphs", "loops_in_graphs")]
     scatters = [case("ant_trap", 1024, 100, scatters=True, flags=name) for name in ("workers", "any_order")]
-    return [*returns, *curve, *again, *ways, *physics, *flags, *scatters]
+    return [*returns, *curve, *again, *low_rank, *ways, *physics, *flags, *scatters]
 
 
 def run(case: dict[str, Any], out: Path, until: float, platform: str) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def spec_of(case: dict[str, Any]) -> WorkerSpec:
     config = load_config(
         {
             "task": {"environment": case["task"], "episode_steps": case["steps"]},
-            "search": {"algorithm": "es", "pairs": pairs, "sigma": SIGMA},
+            "search": {"algorithm": "es", "pairs": pairs, "sigma": SIGMA, "noise": case.get("noise", {"kind": "full"})},
             "policy": {"hidden": case["hidden"], "action_noise": 0.01},
             "compute": {"rollout": "xla", "chunk_pairs": pairs, "rollout_block_pairs": pairs},
         },
