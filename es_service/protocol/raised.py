@@ -39,11 +39,14 @@ def raised(error: BaseException, *names: str) -> RaisedError:
     """An exception as texts. The message of a bug of this project or of a library is the whole traceback.
 
     Args:
-        names: names `package.module:name` of the user's code, for a package that is installed beside the libraries.
+        names: names `package.module:name` of the user's code, for a package that is installed beside the libraries. What
+            is named and raises without a frame, as functions in C and calls with wrong arguments do, is the user's.
     """
     if isinstance(error, RaisedError):
         return error
     whole = "".join(traceback.format_exception(error)).rstrip()
+    if any(names) and error.__traceback__ is not None and error.__traceback__.tb_next is None:
+        return RaisedError("\n".join([_sentence(error), *_notes(error)]), whole)
     return RaisedError(
         users_error(error, *names) or ("\n".join([str(error), *_notes(error)]) if _is_ours(error) else whole), whole
     )

@@ -101,10 +101,11 @@ def runs_inside(folder: Path) -> set[Path]:
 
 def require_run_folder(folder: Path) -> None:
     """Raise StoreError unless a folder contains a run."""
-    if not folder.is_dir():
-        what = "is a file" if folder.exists() else "does not exist"
+    if folder.is_file():
+        raise StoreError(f"{folder} is not a run folder: it is a file", run=folder)
+    if not folder.exists():
         raise StoreError(
-            f"{folder} is not a run folder: it {what}",
+            f"{folder} is not a run folder: it does not exist",
             run=folder,
             ways_out=[WayOut("run", "start a run there", out=str(folder))],
         )

@@ -59,6 +59,10 @@ def tell(state, evaluations):
 
 def unmade(config):
     return {}["sigma"]
+
+
+def of_nothing():
+    return {}
 """
 CONFIG = {
     "task": {"environment": "my_task:Up"},
@@ -116,6 +120,8 @@ def test_a_user_s_own_error_comes_first_with_the_frames_of_the_user_s_files(fold
     ("setting", "said", "frames"),
     [
         ("search.algorithm=my_search:unmade", "my_search:unmade raised KeyError: 'sigma'", ["my_search.py, unmade"]),
+        ("search.algorithm=math:sin", "math:sin raised TypeError: must be real number, not RunConfig", []),
+        ("search.algorithm=my_search:of_nothing", "raised TypeError: of_nothing() takes 0 positional arguments", []),
         ("task.environment=missing:A", "importing missing raised ModuleNotFoundError", ["missing.py, <module>"]),
         ("task.environment=typo:A", "importing typo raised SyntaxError: invalid syntax", ["typo.py, 3"]),
         ("task.environment=nowhere:A", "cannot import nowhere (No module named 'nowhere'); start in the folder", []),
