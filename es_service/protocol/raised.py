@@ -39,8 +39,8 @@ def raised(error: BaseException, *names: str) -> RaisedError:
     """An exception as texts. The message of a bug of this project or of a library is the whole traceback.
 
     Args:
-        names: names `package.module:name` of the user's code, for a package that is installed beside the libraries. What
-            is named and raises without a frame, as functions in C and calls with wrong arguments do, is the user's.
+        names: names `package.module:name` of the user's code, for a package that is installed beside the libraries.
+            What is named and raises without a frame, as a function in C or a call with wrong arguments, is the user's.
     """
     if isinstance(error, RaisedError):
         return error
