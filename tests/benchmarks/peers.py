@@ -4,8 +4,9 @@
     python -m tests.benchmarks.peers --rounds 5             # half an hour on two cores, on which nothing else computes
 
 Each measurement has a process of its own. Before the rounds, QDax's rollouts choose the batch with which they are
-fastest (round 0). Every measurement is a row of results/peers.csv; printed are medians, and how many times as fast
-es-service is. `peers_theirs` measures the others, by their public interfaces; `peers_environments` has their pins.
+fastest (round 0). Every measurement is a row of results/peers.csv, where it takes the place of those of the same
+comparison on the same kind of processor; printed are medians, and how many times as fast es-service is.
+`peers_theirs` measures the others, by their public interfaces; `peers_environments` has their pins.
 """
 
 from __future__ import annotations
@@ -204,6 +205,8 @@ def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Compa
     named = {name: their_versions(folder, name) for name in programs}
     theirs = {name: ", ".join(f"{key} {version_of[key]}" for key in NAMED[name]) for name, version_of in named.items()}
     ours = f"{OURS} {platform_info()['es-service']}, jax {platform_info()['jax']}"
+    kept = pd.read_csv(to) if to.exists() else pd.DataFrame(columns=list(COLUMNS))
+    kept = kept[(kept["cpu"] != cpu_kind()) | ~kept["what"].isin([choice.what for choice in chosen])]
     rows: list[dict[str, Any]] = []
 
     def measured(number: int, comparison: Comparison, program: str, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -214,7 +217,8 @@ def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Compa
         versions = ours if program == OURS else theirs[program]
         row = {"round": number, "program": program, "what": comparison.what, **result}
         rows.append(row | {"cpu": cpu_kind(), "versions": versions})
-        pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(to, index=False, float_format="%.6g", lineterminator="\n")
+        tables = [table for table in (kept, pd.DataFrame(rows, columns=list(COLUMNS))) if len(table)]
+        pd.concat(tables).to_csv(to, index=False, float_format="%.6g", lineterminator="\n")
         print(json.dumps(row), flush=True)
         return row
 
