@@ -91,8 +91,9 @@ class WorkerActor:
         """Run chunks; returns the pickled results, or None if it lacks parents of policies.
 
         Args:
-            chunks: pickled [(index of its subject in `parts`, Chunk)].
-            parts: subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
+            chunks: pickled ([subject], [(index of its subject among these and then `parts`, Chunk)]); with them travel
+                policies that are made of recipes, which are small and for one call.
+            parts: other subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
         """
         assert self._run_chunks is not None, "run was called before build"
         with sendable(self._environment):
@@ -106,8 +107,9 @@ class WorkerActor:
     def _unpacked(self, chunks: bytes, parts: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""
         assert self._parents is not None, "build makes it, too"
-        known = [pickle.loads(part) for part in parts]
+        subjects, indexed = pickle.loads(chunks)
+        known = [*subjects, *map(pickle.loads, parts)]
         for part in known:
             if isinstance(part, dict):
                 self._parents.receive(part)
-        return self._parents.complete([(known[index], chunk) for index, chunk in pickle.loads(chunks)])
+        return self._parents.complete([(known[index], chunk) for index, chunk in indexed])

@@ -10,7 +10,7 @@ from operator import attrgetter
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
+from es_service.protocol.kept_parents import KeptParents, as_sent, is_of_recipes, parents_to_send
 from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce
 from es_service.protocol.messages import FloatArray, Subject, Work
 from es_service.protocol.recipes import Origin
@@ -114,11 +114,14 @@ class Arguments:
         Args:
             kept: see `parents_to_send`.
         """
-        subjects = {id(subject): self._subjects.of(subject) for subject, _ in work}
+        subjects = {id(subject): subject for subject, _ in work}
+        of_recipes = {key: subject for key, subject in subjects.items() if is_of_recipes(subject)}
+        others = {key: self._subjects.of(subject) for key, subject in subjects.items() if key not in of_recipes}
         self._subjects.forget_old()
-        index = {key: number for number, key in enumerate(subjects)}
-        chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
-        return chunks, *subjects.values(), *self._packed_parents(parents_to_send(work, kept))
+        index = {key: number for number, key in enumerate([*of_recipes, *others])}
+        asked = [as_sent(subject) for subject in of_recipes.values()], [(index[id(of)], chunk) for of, chunk in work]
+        parents = self._packed_parents(parents_to_send(work, kept))
+        return pickle.dumps(asked, pickle.HIGHEST_PROTOCOL), *others.values(), *parents
 
     def forget(self) -> None:
         """Forget all that is stored, so that Ray need not keep it."""

@@ -109,7 +109,7 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
         return np.concatenate([full.reshape(whole, *full.shape[2:]), last])
 
     traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
-    flat = joined([replace(result, trace_T_B=None) for result in results])
+    flat = joined(results, traces=False)
     reshaped = replace(each(by_policy, flat), trace_T_B=np.concatenate(traces) if traces else None)
     if not flat.of_steps:
         return reshaped

@@ -13,21 +13,23 @@ ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
 """Arrays that every result has."""
 
 
-def each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> EpisodesResult:
-    """A function of the arrays of results with equal names, array by array; without moments and outputs of steps."""
-    traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
+def each(change: Callable[..., np.ndarray], *results: EpisodesResult, traces: bool = True) -> EpisodesResult:
+    """A function of the arrays of results with equal names, array by array; without moments and outputs of steps, and
+    only if asked for with the traces that all of them have."""
+    of_all = [result.trace_T_B for result in results if result.trace_T_B is not None] if traces else []
     return EpisodesResult(
         *(change(*(getattr(result, name) for result in results)) for name in ARRAYS),
         moments=None,
-        trace_T_B=change(*traces) if len(traces) == len(results) else None,
+        trace_T_B=change(*of_all) if len(of_all) == len(results) else None,
         outputs={name: change(*(result.outputs[name] for result in results)) for name in results[0].outputs},
         failures=tuple(text for result in results for text in result.failures),
     )
 
 
-def joined(results: Sequence[EpisodesResult], count: int | None = None) -> EpisodesResult:
-    """Results along the first axis, one after another, of which the first `count` are kept; without moments."""
-    combined = each(lambda *arrays: np.concatenate(arrays)[:count], *results)
+def joined(results: Sequence[EpisodesResult], count: int | None = None, *, traces: bool = True) -> EpisodesResult:
+    """Results along the first axis, one after another, of which the first `count` are kept; without moments. For
+    `traces` see `each`."""
+    combined = each(lambda *arrays: np.concatenate(arrays)[:count], *results, traces=traces)
     if not (names := results[0].of_steps):
         return combined
     rows = int(combined.steps.sum(dtype=np.int64))

@@ -144,6 +144,11 @@ def as_sent(subject: Subject) -> Subject:
     return _with(subject, Recipes.as_sent)
 
 
+def is_of_recipes(subject: Subject) -> bool:
+    """Whether a subject is policies that are made of recipes."""
+    return isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes)
+
+
 def _recipes_in(work: Sequence[Work]) -> Iterator[Recipes]:
     """The recipes of a work item's subjects, each once, in their order."""
     for subject in {id(subject): subject for subject, _ in work}.values():

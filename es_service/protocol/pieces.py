@@ -51,7 +51,7 @@ def whole(work: Work, results: Sequence[ChunkResult]) -> ChunkResult:
     if len(results) == 1 or len(episodes) < len(results):
         return results[0]
     traces = [result.trace_T_B for result in episodes if result.trace_T_B is not None]
-    combined = joined([replace(result, trace_T_B=None) for result in episodes])
+    combined = joined(episodes, traces=False)
     if not traces:
         return combined
     return replace(combined, trace_T_B=np.concatenate(traces) if isinstance(work[1], PolicyChunk) else traces[0])
@@ -75,15 +75,21 @@ def together(work: Sequence[Work], most: int) -> list[Work]:
         (subject, chunk), recipes = group[0], [_recipes(its_subject) for its_subject, _ in group]
         if id(subject) not in sent:
             sent[id(subject)] = subject
-            if isinstance(subject, Policies) and (first := recipes[0]) is not None:
-                parent_N_2 = np.concatenate([part.parent_N_2 for part in recipes if part is not None])
-                key_N_4 = np.concatenate([part.key_N_4 for part in recipes if part is not None])
-                whole = replace(first, parent_N_2=parent_N_2, key_N_4=key_N_4).part(slice(None))
-                sent[id(subject)] = replace(subject, parameters_N_D=whole)
+            if isinstance(subject, Policies) and recipes[0] is not None:
+                sent[id(subject)] = replace(subject, parameters_N_D=_joined(recipes).part(slice(None)))
         if isinstance(chunk, PolicyChunk) and len(group) > 1:
             chunk = replace(chunk, count=sum(len(part) for part in recipes if part is not None))
         merged.append((sent[id(subject)], chunk))
     return merged
+
+
+def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
+    """Recipes of one ask, one after another."""
+    parts = [part for part in recipes if part is not None]
+    if len(parts) == 1:
+        return parts[0]
+    of_all = (np.concatenate([getattr(part, name) for part in parts]) for name in ("parent_N_2", "key_N_4"))
+    return Recipes(parts[0].rule, parts[0].names, parts[0].parents, *of_all)
 
 
 def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
@@ -96,12 +102,12 @@ def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
         and recipes.names is earlier.names  # those of one ask
         and isinstance(subject, Policies)
         and isinstance(before, Policies)
+        and subject.first + len(recipes) - _first(group[0][0]) <= most
         and subject.episodes == 1
         and subject.observation_mean_N_O is before.observation_mean_N_O is None
         and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
         and chunk == replace(last, chunk_id=last.chunk_id + 1)
         and chunk == PolicyChunk(chunk.generation, chunk.chunk_id, chunk.ask)
-        and subject.first + len(recipes) - _first(group[0][0]) <= most
     )
 
 

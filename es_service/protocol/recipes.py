@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -92,15 +92,16 @@ class Recipes:
 
     def some(self, of: slice) -> Recipes:
         """The recipes of some of the policies, still with the parents of all."""
-        return replace(self, parent_N_2=self.parent_N_2[of], key_N_4=self.key_N_4[of])
+        return Recipes(self.rule, self.names, self.parents, self.parent_N_2[of], self.key_N_4[of])
 
     def as_sent(self) -> Recipes:
         """The recipes without the parents' parameters."""
-        return replace(self, parents=())
+        return Recipes(self.rule, self.names, (), self.parent_N_2, self.key_N_4)
 
     def complete(self, kept: Mapping[bytes, FloatArray]) -> Recipes:
         """The recipes with the parents' parameters, which are taken from others by their names."""
-        return replace(self, parents=tuple(kept[name] for name in self.names))
+        parents = tuple(kept[name] for name in self.names)
+        return Recipes(self.rule, self.names, parents, self.parent_N_2, self.key_N_4)
 
     def made(self, vary: Variation = variation) -> FloatArray:
         """The parameters of the policies, [N, D].

@@ -211,7 +211,7 @@ class EchoActor:
     def run(self, chunks: bytes, *centres: bytes) -> bytes:
         """As `WorkerActor.run`."""
         until = time.perf_counter() + SPIN_S
-        asked: list[tuple[int, Chunk]] = pickle.loads(chunks)
+        asked: list[tuple[int, Chunk]] = pickle.loads(chunks)[1]
         while time.perf_counter() < until:
             pass
         return pickle.dumps([self._answers[type(chunk).__name__] for _, chunk in asked], pickle.HIGHEST_PROTOCOL)

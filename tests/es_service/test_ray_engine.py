@@ -140,7 +140,7 @@ class PretendedRay:
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
             "compile": lambda chunks, *centres: 0.0,
-            "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)]),
+            "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)[1]]),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
         return SimpleNamespace(itself=actor, **calls)
@@ -152,7 +152,7 @@ class PretendedRay:
             if name == "run":
                 self.calls.append(arguments)
             if name == "compile":
-                self.compiled.append((actor.number, type(pickle.loads(arguments[0])[0][1]).__name__))
+                self.compiled.append((actor.number, type(pickle.loads(arguments[0])[1][0][1]).__name__))
             if name == "build" and self.node_of(actor.number) in self.refusing:
                 ref.error = OtherCodeRayTaskError(f"{self.node_of(actor.number)} has other code: a.py")
             if name == "run" and actor.state == "alive":
@@ -518,7 +518,7 @@ def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_whil
         assert engine.evaluate(work) == [f"of {chunk}" for _, chunk in work]
         for packed, *centres in ray.calls:
             known = [pickle.loads(ray.stored[one] if isinstance(one, int) else one) for one in centres]
-            chunks = pickle.loads(packed)
+            chunks = pickle.loads(packed)[1]
             assert [known[index].parameters_D[0] for index, _ in chunks] == [chunk.chunk_id for _, chunk in chunks]
             assert sorted({index for index, _ in chunks}) == list(range(len(known)))
             assert len({one.parameters_D[0] for one in known}) == len(known)

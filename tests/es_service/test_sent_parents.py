@@ -174,6 +174,8 @@ def test_a_large_parent_is_stored_once_for_all_actors_and_a_small_one_never():
                 evaluator.evaluate(work := generations.next())
                 names |= {name for subject, _ in work for name in subject.parameters_N_D.names}
         assert len(pretended.stored) == (len(names) if is_stored else 0)
+        if not is_stored:
+            assert max(map(len, pretended.calls)) == 2, "the policies of all chunks are one argument, and their parents"
 
 
 @pytest.mark.parametrize("keeps", [1, 20, 40])
