@@ -196,7 +196,7 @@ CASES = [
     *cases(
         "novelty counts the own entry",
         f"{OF_ME_ES} tests/laws/test_me_es_blocks.py",
-        ("of an elite to draw", STARTS, "exclude_Q=_own_entries(map_, archive)", "exclude_Q=None"),
+        ("of an elite to draw", STARTS, "exclude_Q=_entries_of_elites(map_, archive)", "exclude_Q=None"),
         (
             "of another centre of the same generation",
             STARTS,

@@ -95,7 +95,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
 
     Lanes repeat to fill the chunk, whose shape never changes.
     """
-    evaluated = _make_episodes(environment, spec, training=False, own_statistics=True)
+    evaluated = _make_episodes(environment, spec, training=False, per_lane_statistics=True)
     episodes = jitted(lambda parameters_L_D, *given: evaluated(_act_each(spec.policy, parameters_L_D), *given))
 
     def filled(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
@@ -110,28 +110,28 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     return Compilable(rollout, lambda *given: episodes.compile(*filled(*given)))
 
 
-def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weights: bool) -> Callable[..., Carry]:
+def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, per_lane_weights: bool) -> Callable[..., Carry]:
     """Rollout of one evaluation episode that keeps what it went through, for replays; compiled at its first call.
 
     The episode runs in its slot of a whole chunk, with the loop of `_make_episodes`, since XLA may give other bits for
     another shape. The loop keeps the carry that each step begins with, which no computation of the step depends on.
 
     Args:
-        own_weights: whether the episode is that of an explicit policy, or else that of a centre.
+        per_lane_weights: whether the episode is that of an explicit policy, or else that of a centre.
 
     Returns:
         f(centre_D, mean_O, std_O, reset_key_4, slot) -> Carry with leading axis [T + 1], of the reset and after every
         step until the episode is done; the rest is 0.
     """
-    lanes = POLICY_SLOTS if own_weights else EVALUATION_EPISODES_PER_CHUNK
-    episodes = _make_episodes(environment, spec, training=False, own_statistics=own_weights, watched=True)
-    policies = _act_each if own_weights else _act_shared
+    lanes = POLICY_SLOTS if per_lane_weights else EVALUATION_EPISODES_PER_CHUNK
+    episodes = _make_episodes(environment, spec, training=False, per_lane_statistics=per_lane_weights, watched=True)
+    policies = _act_each if per_lane_weights else _act_shared
 
     def rollout(centre_D, mean_O, std_O, reset_key, slot):
         def in_lanes(array):
             return jnp.broadcast_to(array, (lanes, *array.shape))
 
-        if own_weights:
+        if per_lane_weights:
             centre_D, mean_O, std_O = map(in_lanes, (centre_D, mean_O, std_O))
         return episodes(policies(spec.policy, centre_D), mean_O, std_O, in_lanes(reset_key), slot=slot)
 
@@ -209,17 +209,22 @@ def _make_member_episodes(environment: Environment, spec: WorkerSpec):
 
 
 def _make_episodes(
-    environment: Environment, spec: WorkerSpec, *, training: bool, own_statistics: bool = False, watched: bool = False
+    environment: Environment,
+    spec: WorkerSpec,
+    *,
+    training: bool,
+    per_lane_statistics: bool = False,
+    watched: bool = False,
 ):
     """Function that runs one episode per lane.
 
     Returns:
         f(policies, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training
-        there is action noise. With `own_statistics` every lane has its own statistics [L, O]. If `watched`, the
+        there is action noise. With `per_lane_statistics` every lane has its own statistics [L, O]. If `watched`, the
         function has an argument `slot` and returns the carries [T + 1] of that lane instead.
     """
     steps = episode_steps(environment, spec, training=training)
-    of_statistics = 0 if own_statistics else None
+    of_statistics = 0 if per_lane_statistics else None
     observe = jax.vmap(steps.normalised_observation, in_axes=(0, of_statistics, of_statistics))
     advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0))
 

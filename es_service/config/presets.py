@@ -62,10 +62,10 @@ def preset_table(algorithms: Mapping[str, Any]) -> list[PresetRow]:
     rows: dict[int, PresetRow] = {}
     for name, method in algorithms.items():
         settings = method.settings
-        own_keys = {f"search.{key}" for key in settings.model_fields.keys() - settings.__base__.model_fields.keys()}
-        own_rows = vars(settings).get("presets", ())
+        added_keys = {f"search.{key}" for key in settings.model_fields.keys() - settings.__base__.model_fields.keys()}
+        added_rows = vars(settings).get("presets", ())
         rows |= {
-            id(row): replace(row, method=name) if row in own_rows and row.key not in own_keys else row
+            id(row): replace(row, method=name) if row in added_rows and row.key not in added_keys else row
             for row in preset_rows(settings)
         }
     return sorted(rows.values(), key=lambda row: row.method is not None)

@@ -35,8 +35,8 @@ from es_service.protocol.messages import (
     Moments,
     TrainingChunk,
     Work,
-    around,
     evaluation_chunks,
+    with_subject,
 )
 from es_service.search.algorithms.base import (
     Algorithm,
@@ -106,7 +106,9 @@ def evaluate_populations(
         within each, of its chunks; and the results of each ask for policies, with axes [N, E].
     """
     asked = [
-        around(centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
+        with_subject(
+            centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)]
+        )
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
     answers = _evaluate(EpisodesResult, evaluator, [*asked, *(policy_work.work for policy_work in policies)], meanwhile)
@@ -139,7 +141,7 @@ def evaluate_centres(
         start, ask = first, index if resets == "by_ask" else 0
         if resets == "by_chunk":
             start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
-        asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
+        asked.append(with_subject(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
     answers = _evaluate(EpisodesResult, evaluator, asked)
     return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in answers]
 
@@ -167,7 +169,7 @@ def estimate_gradients(
             block_P = weights_P[first : first + block_pairs]
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
             chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
-        asked.append(around(NO_CENTRE, chunks))
+        asked.append(with_subject(NO_CENTRE, chunks))
     answers = _evaluate(GradientResult, evaluator, asked)
     return [
         tree_sum(results) * np.float32(1.0 / weights_P.size)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from es_service.protocol.episodes import each, joined
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
+from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
 from es_service.protocol.recipes import Recipes, remember
@@ -79,15 +79,15 @@ def policy_work(
     has_none = not (mean_N_O.any() or np.signbit(mean_N_O).any()) and bool((std_N_O == 1.0).all())
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
-        given = parameters_N_D.some(of) if isinstance(parameters_N_D, Recipes) else _own(parameters_N_D[of])
-        of_each = () if has_none else (_own(array[of]) for array in statistics)
+        given = parameters_N_D.some(of) if isinstance(parameters_N_D, Recipes) else _contiguous(parameters_N_D[of])
+        of_each = () if has_none else (_contiguous(array[of]) for array in statistics)
         policies = Policies(first, episodes, seed, traces, given, *of_each, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
-        work += around(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
+        work += with_subject(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
     return PolicyWork(parameters_N_D, *statistics, episodes, work)
 
 
-def _own(array: FloatArray) -> FloatArray:
+def _contiguous(array: FloatArray) -> FloatArray:
     return np.ascontiguousarray(array)
 
 

@@ -228,7 +228,7 @@ FAILURES_TOLD = 16
 """Most failed episodes that the result of a chunk names."""
 
 
-def around(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
+def with_subject(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
     """The chunks, each with the same subject."""
     return [(subject, chunk) for chunk in chunks]
 

@@ -130,7 +130,7 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
             for name, part in parts.items()
         }
     if "search.parent_statistics" in changed and constants["search.parent_statistics"] == "global":
-        parts = _without_own_statistics(parts)
+        parts = _without_elite_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     return _lineage(origin, at), Beginning(
         _history(origin, at), parts, platforms, newest=at, evaluations=_evaluations(origin, at)
@@ -168,7 +168,7 @@ def _without_scores(parts: Parts) -> dict[str, Arrays]:
     return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
 
 
-def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
+def _without_elite_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
     """The parts of a state whose centres all use the observation statistics of the whole run, also in the middle of a
     block that began with those of an elite."""
     own = ("own_mean_O", "own_std_O")

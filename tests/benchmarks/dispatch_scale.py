@@ -23,7 +23,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Assign, Compiled, Limits, Result, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
-from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, around
+from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, with_subject
 
 SIZES = ((10, 10), (100, 100), (1000, 1000), (10_000, 10_000), (10_000, 100))
 """(items, workers)."""
@@ -72,7 +72,7 @@ def engine_seconds(items: int, workers: int) -> list[float]:
     seconds = []
     with Engine(AnswersAtOnce(), limits_of(workers)) as engine:
         for generation in range(GENERATIONS):
-            work = around(NO_CENTRE, [TrainingChunk(generation, chunk_id) for chunk_id in range(items)])
+            work = with_subject(NO_CENTRE, [TrainingChunk(generation, chunk_id) for chunk_id in range(items)])
             started = time.perf_counter()
             engine.evaluate(work)
             seconds.append(time.perf_counter() - started)

@@ -36,7 +36,7 @@ from es_service.protocol.messages import (
     GradientResult,
     TrainingChunk,
     Work,
-    around,
+    with_subject,
 )
 from tests.helpers import SPEC
 from tests.system.cluster import Cluster, missing
@@ -110,8 +110,8 @@ def drive(address: str, case: Case) -> dict[str, Any]:
             training = [TrainingChunk(generation, i) for i in range(workers * case.training_chunks)]
             gradient = [GradientChunk(generation, i, weights_P) for i in range(workers)]
             began, cpu_s = time.perf_counter(), time.process_time()
-            engine.evaluate(around(centre, training))
-            engine.evaluate(around(NO_CENTRE, gradient))
+            engine.evaluate(with_subject(centre, training))
+            engine.evaluate(with_subject(NO_CENTRE, gradient))
             seconds.append(time.perf_counter() - began)
             driver_s.append(time.process_time() - cpu_s)
         counts = engine.counts

@@ -38,7 +38,7 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.evaluator import Evaluator
-from es_service.protocol.messages import EpisodesResult, TrainingChunk, around
+from es_service.protocol.messages import EpisodesResult, TrainingChunk, with_subject
 from tests.helpers import centre
 from workers.policies.policy import initial_parameters
 
@@ -51,7 +51,9 @@ def measure(engine: Evaluator, point: Any, chunks: int, seconds: float) -> float
     """Steps per second over whole populations, at least one, for about `seconds`."""
     steps, start = 0, time.perf_counter()
     while not steps or time.perf_counter() - start < seconds:
-        results = engine.evaluate(around(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)]))
+        results = engine.evaluate(
+            with_subject(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)])
+        )
         steps += sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
     return steps / (time.perf_counter() - start)
 

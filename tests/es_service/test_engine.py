@@ -20,7 +20,7 @@ from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, item_sizes
 from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
+from es_service.protocol.messages import EvaluationChunk, TrainingChunk, with_subject
 from tests.helpers import centre, random_parameters
 
 FIRST, SECOND = centre(random_parameters(0)), centre(random_parameters(1))
@@ -119,7 +119,7 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed, mon
     with Engine(transport, Limits(workers=3)) as engine:
         for point in (FIRST, SECOND, FIRST):
             chunks = rng.sample(CHUNKS, len(CHUNKS))
-            assert engine.evaluate(around(point, chunks)) == [expected(point, chunk) for chunk in chunks]
+            assert engine.evaluate(with_subject(point, chunks)) == [expected(point, chunk) for chunk in chunks]
         assert (engine.counts.retries, engine.counts.lost_workers, engine.counts.workers) == (0, 0, 3)
     assert transport.closed
 
@@ -152,7 +152,7 @@ def test_chunks_of_several_kinds_run_side_by_side_and_no_work_item_has_two():
     transport.on_send, transport.on_wait = held.append, lambda: transport.inbox.append(held.pop().answer())
     with Engine(transport, Limits(workers=2, item_s=60.0)) as engine:
         for _ in range(3):
-            work = around(FIRST, [*CHUNKS, *(EvaluationChunk(1, chunk) for chunk in range(5)), *CHUNKS])
+            work = with_subject(FIRST, [*CHUNKS, *(EvaluationChunk(1, chunk) for chunk in range(5)), *CHUNKS])
             assert engine.evaluate(work) == [expected(*one) for one in work]
     assert all(len({type(chunk) for _, chunk in sent.work}) == 1 for sent in transport.sent)
     assert {sent.item_id.kind for sent in transport.sent} == {"TrainingChunk", "EvaluationChunk"}
@@ -200,7 +200,7 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
         for count in (8, 6, 200):
             transport.sent.clear()
             chunks = [TrainingChunk(3, chunk_id) for chunk_id in range(count)]
-            assert engine.evaluate(around(FIRST, chunks)) == [expected(FIRST, chunk) for chunk in chunks]
+            assert engine.evaluate(with_subject(FIRST, chunks)) == [expected(FIRST, chunk) for chunk in chunks]
             assert [chunk for sent in transport.sent for chunk in sent.chunks] == chunks
             numbers.append([len(sent.chunks) for sent in transport.sent])
     assert numbers[:2] == [[1] * 8, [3, 3]]
@@ -210,13 +210,13 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
 def test_chunks_are_sent_when_an_evaluation_begins_and_their_results_can_be_left_behind():
     transport = Scripted()
     with Engine(transport, Limits(workers=2)) as engine:
-        engine.evaluate(around(FIRST, CHUNKS))
+        engine.evaluate(with_subject(FIRST, CHUNKS))
         sent = len(transport.sent)
-        wait = engine.begin(around(SECOND, CHUNKS))
+        wait = engine.begin(with_subject(SECOND, CHUNKS))
         assert len(transport.sent) > sent
         assert wait() == [expected(SECOND, chunk) for chunk in CHUNKS]
-        engine.begin(around(SECOND, CHUNKS))
-        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        engine.begin(with_subject(SECOND, CHUNKS))
+        assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert engine._results == {}
 
 
@@ -236,21 +236,21 @@ def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_t
 
     transport.on_send = contradict
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         if already_there:
             transport.inbox.append(late[0])
         transport.on_send = lambda sent: transport.inbox.extend([*late, sent.answer()])
-        assert engine.evaluate(around(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
         assert transport.killed == []
 
 
 def test_a_worker_lost_between_two_calls_gets_no_chunk_and_no_chunk_is_blamed():
     transport = Scripted()
     with Engine(transport, Limits(workers=2)) as engine:
-        engine.evaluate(around(FIRST, CHUNKS))
+        engine.evaluate(with_subject(FIRST, CHUNKS))
         transport.inbox.append(WorkerLost(0, "gone"))
         transport.sent.clear()
-        assert engine.evaluate(around(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
         assert {sent.worker for sent in transport.sent} == {1, 2}
         assert {sent.attempt for sent in transport.sent} == {1}
         assert (engine.counts.retries, engine.counts.lost_workers) == (0, 1)
@@ -264,7 +264,7 @@ def test_the_chunk_of_a_worker_lost_in_mid_call_runs_elsewhere():
 
     transport.on_send = die_once
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert (engine.counts.retries, engine.counts.lost_workers) == (2, 1)
 
 
@@ -282,7 +282,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
 
     transport.on_send = contradict
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert engine.counts.lost_workers == 1
 
 
@@ -294,7 +294,7 @@ def test_a_chunk_that_fails_everywhere_is_named_and_ends_the_engine():
     with Engine(transport, Limits(workers=2, restart_backoff_s=0.0)) as engine:
         for _ in range(2):  # and again, rather than wait for ever, if it is asked again
             with pytest.raises(EvaluationError, match=r"TrainingChunk 2 of generation 3 failed in 4 attempts.*: no"):
-                engine.evaluate(around(FIRST, CHUNKS))
+                engine.evaluate(with_subject(FIRST, CHUNKS))
         assert sorted(transport.killed) == [0, 1]
 
 
@@ -312,7 +312,7 @@ def test_a_request_to_stop_is_noticed_at_the_next_message_or_poll(flood):
         transport.on_wait = lambda: transport.inbox.extend([WorkerUp(0)] * 1000)
     with Engine(transport, Limits(workers=2), should_stop) as engine:
         with pytest.raises(Interrupted) as caught:
-            engine.evaluate(around(FIRST, CHUNKS))
+            engine.evaluate(with_subject(FIRST, CHUNKS))
         assert caught.value.signal_number == signal.SIGTERM
     assert len(asked) == 4
     assert len(transport.waits) - asked[0] == 3
@@ -332,7 +332,7 @@ def test_answers_that_wait_are_read_before_the_clock(monkeypatch, answered):
 
     transport.on_send = leap
     with Engine(transport, Limits(workers=2, first_chunk_timeout_s=1.0, chunk_timeout_s=1.0)) as engine:
-        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert transport.killed == ([] if answered else [0, 1])
         assert engine.counts.lost_workers == (0 if answered else 2)
 
@@ -343,7 +343,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
     transport = scripted_with_clock(monkeypatch, now)
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
     with Engine(transport, Limits(workers=1, first_chunk_timeout_s=0.25, chunk_timeout_s=0.25)) as engine:
-        engine.evaluate(around(FIRST, CHUNKS))
+        engine.evaluate(with_subject(FIRST, CHUNKS))
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
 
@@ -364,7 +364,7 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     with Engine(transport, limits) as engine:
         if is_last:
             with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*its process:\nno licence; retrying$"):
-                engine.evaluate(around(FIRST, CHUNKS))
+                engine.evaluate(with_subject(FIRST, CHUNKS))
         else:
-            engine.evaluate(around(FIRST, CHUNKS))
+            engine.evaluate(with_subject(FIRST, CHUNKS))
         assert re.search(r"^worker 0: no answer .* output of its process:\nno licence; retrying$", engine.last_loss())

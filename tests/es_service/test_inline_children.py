@@ -15,7 +15,7 @@ import pytest
 from es_service.dispatch.events import Limits, StartWorker, Submit
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk, around
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk, with_subject
 from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec, stop
 
 FIRST = centre(random_parameters(0))
@@ -48,7 +48,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
 
     limits = Limits(workers=1, item_s=0.0, restart_backoff_s=0.01)
     with inline_engine(SPEC, limits, kill_in_the_middle) as engine:
-        first = engine.evaluate(around(FIRST, chunks))
+        first = engine.evaluate(with_subject(FIRST, chunks))
         settled = footprint()
         for kill in range(1, 9):
             (victim,) = engine.transport.process_ids().values()
@@ -56,7 +56,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
                 os.kill(victim, signal.SIGKILL)
             else:
                 countdown = 3  # asked once before each message, so two of the eight have been answered
-            assert_same(engine.evaluate(around(FIRST, chunks)), first)
+            assert_same(engine.evaluate(with_subject(FIRST, chunks)), first)
             assert engine.counts.lost_workers == kill
         assert footprint() == settled
     assert footprint() == before
@@ -73,12 +73,12 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]
     before = footprint()
     with inline_engine(wide, Limits(workers=1, chunk_timeout_s=0.5)) as engine:
-        result = engine.evaluate(around(one, chunks))
+        result = engine.evaluate(with_subject(one, chunks))
         with pytest.raises(AssertionError):
-            assert_same(engine.evaluate(around(other, chunks)), result)
+            assert_same(engine.evaluate(with_subject(other, chunks)), result)
         (victim,) = engine.transport.process_ids().values()
         stop(victim)
-        assert_same(engine.evaluate(around(one, chunks)), result)
+        assert_same(engine.evaluate(with_subject(one, chunks)), result)
         assert engine.counts.lost_workers == 1
         assert victim not in engine.transport.process_ids().values()
     assert footprint() == before
@@ -94,7 +94,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
         inline_engine(SPEC, Limits(workers=1, restart_backoff_s=0.0)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)3 consecutive attempts.*cannot be started.*Too many open files"),
     ):
-        engine.evaluate(around(FIRST, CHUNKS))
+        engine.evaluate(with_subject(FIRST, CHUNKS))
     assert footprint() == before
 
 
@@ -103,7 +103,7 @@ def test_threads_that_are_lost_together_before_they_are_up_do_not_end_the_run():
     with inline_engine(SPEC, Limits(workers=6, restart_backoff_s=0.01), threads=True) as engine:
         (victim,) = set(engine.transport.process_ids().values())
         os.kill(victim, signal.SIGKILL)
-        assert len(engine.evaluate(around(FIRST, CHUNKS))) == len(CHUNKS)
+        assert len(engine.evaluate(with_subject(FIRST, CHUNKS))) == len(CHUNKS)
         assert (engine.counts.lost_workers, engine.counts.retries) == (6, 0)
 
 
@@ -127,15 +127,15 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     long = spec(rollout="simd", episode_steps=200_000)
     limits = Limits(workers=6, chunk_timeout_s=3.0, restart_backoff_s=0.01)
     with inline_engine(long, limits, threads=True) as engine:
-        expected = engine.evaluate(around(FIRST, CHUNKS[:1]))
-        engine.evaluate(around(FIRST, CHUNKS[:1]))  # so that it is known how long it takes
+        expected = engine.evaluate(with_subject(FIRST, CHUNKS[:1]))
+        engine.evaluate(with_subject(FIRST, CHUNKS[:1]))  # so that it is known how long it takes
         (victim,) = set(engine.transport.process_ids().values())
         timer = threading.Timer(0.02, os.kill, (victim, number))
         timer.start()
         for _ in range(3):
-            assert_same(engine.evaluate(around(FIRST, CHUNKS[:1])), expected)
+            assert_same(engine.evaluate(with_subject(FIRST, CHUNKS[:1])), expected)
         timer.join()
-        assert_same(engine.evaluate(around(FIRST, CHUNKS[:4]))[:1], expected)
+        assert_same(engine.evaluate(with_subject(FIRST, CHUNKS[:4]))[:1], expected)
         assert engine.counts.lost_workers == 6
         assert victim not in engine.transport.process_ids().values()
         assert len(set(engine.transport.process_ids().values())) == 1
@@ -146,9 +146,9 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
     with inline_engine(SPEC, Limits(workers=1, item_s=60.0, restart_backoff_s=0.0)) as engine:
-        engine.evaluate(around(FIRST, CHUNKS))
+        engine.evaluate(with_subject(FIRST, CHUNKS))
         with pytest.raises(EvaluationError, match=r"(?s)in TrainingChunk four of.*item TrainingChunk 0 and 3 more of"):
-            engine.evaluate(around(FIRST, broken))
+            engine.evaluate(with_subject(FIRST, broken))
 
 
 @pytest.mark.slow

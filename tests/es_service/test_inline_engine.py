@@ -26,7 +26,7 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import kept_subjects
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_subjects import KEPT_SUBJECTS, forget_old_subjects
-from es_service.protocol.messages import TrainingChunk, Work, around
+from es_service.protocol.messages import TrainingChunk, Work, with_subject
 from es_service.protocol.raised import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -198,7 +198,7 @@ def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(trans
 def test_a_thread_that_has_answered_everything_is_a_bystander_of_its_child_s_end(transport):
     transport, ends = transport
     for worker in range(2):
-        transport.send(worker, worker, 1, around(FIRST, CHUNKS[:1]))
+        transport.send(worker, worker, 1, with_subject(FIRST, CHUNKS[:1]))
     ends[0].sendall(framed(("results", 0, 1, ["its own"])))
     ends[1].close()
     heard = [transport.receive(1.0) for _ in range(3)]
@@ -259,7 +259,7 @@ def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, m
 def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):
     transport, ends = transport
     for key in range(40):
-        transport.send(0, key, 1, around(centre(np.zeros(100_000, np.float32)), CHUNKS[:1]))
+        transport.send(0, key, 1, with_subject(centre(np.zeros(100_000, np.float32)), CHUNKS[:1]))
     assert transport._workers[0].channel.is_full
     ends[0].shutdown(socket.SHUT_WR)
     assert isinstance(transport.receive(1.0), WorkerLost)
@@ -269,7 +269,7 @@ def test_a_default_timeout_of_sockets_is_not_the_workers():
     socket.setdefaulttimeout(0.001)
     try:
         with inline_engine(SPEC, Limits(workers=1)) as engine:
-            engine.evaluate(around(FIRST, CHUNKS[:2]))
+            engine.evaluate(with_subject(FIRST, CHUNKS[:2]))
             assert engine.counts.lost_workers == 0
     finally:
         socket.setdefaulttimeout(None)
@@ -282,4 +282,4 @@ def test_an_environment_that_exits_is_a_failure_with_its_traceback():
         inline_engine(exits, Limits(workers=1, max_failures_in_a_row=1, max_attempts=2)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)SystemExit.*out of here"),
     ):
-        engine.evaluate(around(FIRST, CHUNKS[:1]))
+        engine.evaluate(with_subject(FIRST, CHUNKS[:1]))

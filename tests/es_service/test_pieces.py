@@ -10,7 +10,7 @@ import pytest
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
-from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, around, evaluation_chunks
+from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, evaluation_chunks, with_subject
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.pieces import pieces_of, separated, together, whole
 from es_service.protocol.policies import POLICY_SLOTS
@@ -35,7 +35,7 @@ def test_the_results_of_pieces_are_those_of_whole_chunks(most):
     parameters_N_D = np.stack([random_parameters(seed, size) for seed in range(21)])
     statistics = np.zeros((21, 3), np.float32), np.ones((21, 3), np.float32)
     asked = policy_work(parameters_N_D, statistics, 3, seed=3, generation=2, traces=True)
-    work = [*around(subject, evaluation_chunks(2, 23)), *asked.work]
+    work = [*with_subject(subject, evaluation_chunks(2, 23)), *asked.work]
     for one in work:
         pieces, [expected] = pieces_of(one, most), run([one])
         results = [result for piece in pieces for result in run([piece])]
@@ -55,7 +55,7 @@ def test_an_engine_puts_together_what_it_has_sent_in_pieces():
     parameters_N_D = np.stack([random_parameters(seed, DRIFT.policy.parameters) for seed in range(20)])
     statistics = np.zeros((20, 3), np.float32), np.ones((20, 3), np.float32)
     asked = policy_work(parameters_N_D, statistics, 2, seed=3, generation=2, traces=True)
-    work = [*around(subject, [TrainingChunk(1, 0), *evaluation_chunks(2, 20)]), *asked.work]
+    work = [*with_subject(subject, [TrainingChunk(1, 0), *evaluation_chunks(2, 20)]), *asked.work]
     found = []
     for limits in (Limits(1), replace(Limits(2), episodes_together=1)):
         with inline_engine(DRIFT, limits) as engine:
@@ -116,7 +116,9 @@ def test_only_neighbours_of_one_ask_are_one_chunk():
     assert counts == [16] * len(several) + [33, 33, 16] + [16] * len(explicit)
     subjects = {id(subject) for subject, _ in together(several, 128)}
     assert len(subjects) == 3, "chunks of the same policies share them"
-    training = around(centre(random_parameters(0, 10), observation_size=2), [TrainingChunk(1, 0), TrainingChunk(1, 1)])
+    training = with_subject(
+        centre(random_parameters(0, 10), observation_size=2), [TrainingChunk(1, 0), TrainingChunk(1, 1)]
+    )
     assert together(training, 128) == training
 
 

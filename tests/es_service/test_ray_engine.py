@@ -20,7 +20,7 @@ from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.kept_subjects import KEPT_SUBJECTS
-from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
+from es_service.protocol.messages import EvaluationChunk, TrainingChunk, with_subject
 from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters
 
@@ -209,9 +209,9 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
 
     with ray_engine(ray, limits) as engine:
         while not all(actor.ran for actor in ray.actors):  # so that all are up
-            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = node_dies
-        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
 
 
@@ -232,9 +232,9 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
     assert [actors.receive(0.0) for _ in range(3)] == [Placed(1), WorkerUp(1), None]
     ray.end(ray.actors[1])
     for worker in (1, 0):
-        actors.send(worker, "key", 1, around(FIRST, [CHUNK]))
+        actors.send(worker, "key", 1, with_subject(FIRST, [CHUNK]))
     assert isinstance(actors.receive(0.0), WorkerLost)
-    actors.send(0, "other key", 1, around(FIRST, [CHUNK]))
+    actors.send(0, "other key", 1, with_subject(FIRST, [CHUNK]))
     assert [type(actors.receive(0.0)) for _ in range(4)] == [Compiled, Answer, Answer, type(None)]
 
 
@@ -248,7 +248,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 
     with ray_engine(ray, limits) as engine:
         ray.on_run = hang
-        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
         assert "no answer to work item" in engine.last_loss()
@@ -292,7 +292,7 @@ def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypa
     watch.now = Membership({"node": 2}, {}, frozenset(), frozenset({"node"}))
     limits = Limits(2, start_timeout_s=0.2)
     with Engine(transport(ray, limits, watch), limits, should_stop, on_wait=told.append) as engine:
-        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         engine.wait_for_place()
         assert len(told) == 2
         assert told[0].startswith("Each worker needs 1 CPU; the cluster has 2 CPU")
@@ -334,7 +334,7 @@ def test_work_is_divided_among_the_workers_that_have_a_place():
         chunks = [TrainingChunk(2, chunk) for chunk in range(18)]
         for _ in range(3):  # so that it is known how long a chunk takes
             ray.calls.clear()
-            engine.evaluate(around(FIRST, chunks))
+            engine.evaluate(with_subject(FIRST, chunks))
         assert len(ray.calls) == 2
 
 
@@ -355,21 +355,21 @@ def test_an_actor_compiles_once_for_each_kind_and_nothing_else_is_asked_of_it():
     ray = PretendedRay()
     with ray_engine(ray, Limits(2)) as engine:
         for _ in range(3):
-            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
-            engine.evaluate(around(FIRST, [EvaluationChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [EvaluationChunk(2, chunk) for chunk in range(20)]))
         kinds = ("EvaluationChunk", "TrainingChunk")
         assert sorted(ray.compiled) == [(actor, kind) for actor in (0, 1) for kind in kinds]
         calls = [len(actor.owed) for actor in ray.actors]
         assert sum(calls) == 2 * (2 + len(kinds)) + len(ray.calls), "place and build, compile, run"
     actors = transport(ray := PretendedRay(), Limits(1))
     actors.start(0)
-    actors.send(0, "a", 1, around(FIRST, [CHUNK]))
-    actors.send(0, "b", 1, around(FIRST, [CHUNK]))
+    actors.send(0, "a", 1, with_subject(FIRST, [CHUNK]))
+    actors.send(0, "b", 1, with_subject(FIRST, [CHUNK]))
     for call in (2, 3):
         ray.actors[0].owed[call].error = RayTaskError("no")
     told = [type(actors.receive(0.0)) for _ in range(5)]
     assert told == [Placed, WorkerUp, Failure, Answer, type(None)]
-    actors.send(0, "a", 2, around(FIRST, [CHUNK]))
+    actors.send(0, "a", 2, with_subject(FIRST, [CHUNK]))
     assert [type(actors.receive(0.0)) for _ in range(3)] == [Compiled, Answer, type(None)]
 
 
@@ -385,7 +385,7 @@ def test_a_node_that_refuses_is_told_of_once_and_gets_no_other_worker(grows):
     with Engine(actors, limits) as engine:
         for _ in range(5):
             chunks = [TrainingChunk(2, chunk) for chunk in range(20)]
-            assert engine.evaluate(around(FIRST, chunks)) == [f"of {chunk}" for chunk in chunks]
+            assert engine.evaluate(with_subject(FIRST, chunks)) == [f"of {chunk}" for chunk in chunks]
         assert told == ["bad has other code: a.py"]
         assert engine.counts.lost_workers == 0
         assert [ray.node_of(actor.number) for actor in ray.actors].count("bad") == (2 if grows else 3)
@@ -406,21 +406,21 @@ def test_a_run_ends_at_once_if_every_node_refuses_but_not_before_its_last_worker
     ray.node_of = lambda number: "bad"
     with Engine(transport(ray, Limits(2), watch), Limits(2, restart_backoff_s=0.0)) as engine:
         while not all(actor.ran for actor in ray.actors):
-            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.refusing = {"bad"}
         ray.end(ray.actors[1])
         for _ in range(3):
-            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.end(ray.actors[0])
         for actor in ray.actors[2:]:
             ray.end(actor)
         with pytest.raises(EvaluationError, match="bad has other code"):
-            engine.evaluate(around(FIRST, [CHUNK]))
+            engine.evaluate(with_subject(FIRST, [CHUNK]))
     ray = PretendedRay()
     ray.node_of, ray.refusing = (lambda number: "bad"), {"bad"}
     with Engine(transport(ray, Limits(2), watch), Limits(2)) as engine:
         with pytest.raises(EvaluationError, match="bad has other code"):
-            engine.evaluate(around(FIRST, [CHUNK]))
+            engine.evaluate(with_subject(FIRST, [CHUNK]))
         assert all(ray.selectors[2:]), "none of those that replace the first two could get a place there"
 
 
@@ -433,12 +433,12 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
             watch.now = Membership({"old": 2, "new": 2}, {}, frozenset(), frozenset(alive))
-            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
             assert engine.counts.lost_workers == 0
         for number in range(2):
             ray.end(ray.actors[number])
         watch.now = Membership({"new": 2}, {}, frozenset(), frozenset({"new"}))
-        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
         assert "its node died" in engine.last_loss()
         assert [actor.state for actor in ray.actors[:4]] == ["dead", "dead", "alive", "alive"]
@@ -467,7 +467,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
         actors.start(worker)
     while actors.receive(0.0):
         pass
-    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
+    actors.send(0, "key", 1, with_subject(FIRST, [CHUNK]))
     watch.now = Membership({"2": 1}, {}, frozenset("1"), frozenset("12"))
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
@@ -485,7 +485,7 @@ def test_what_is_said_of_an_error_has_no_colours(error, call):
     ray = PretendedRay()
     actors = transport(ray, Limits(1))
     actors.start(0)
-    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
+    actors.send(0, "key", 1, with_subject(FIRST, [CHUNK]))
     ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
     told = [actors.receive(0.0) for _ in range(4)]
     said = [message.reason for message in told if isinstance(message, WorkerLost)]
@@ -498,10 +498,10 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
     """Although all the others were asked whether they are still there: they are."""
     ray = PretendedRay()
     with ray_engine(ray, Limits(9)) as engine:
-        engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+        engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = ray.end
         with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):
-            engine.evaluate(around(FIRST, [CHUNK]))
+            engine.evaluate(with_subject(FIRST, [CHUNK]))
         assert engine.counts.lost_workers == 4
 
 

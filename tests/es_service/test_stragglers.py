@@ -33,7 +33,7 @@ from es_service.dispatch.events import (
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import IN_TIME, LATE, NEW, SchedulerState, next_deadline, pending
 from es_service.protocol.gradient_tree import tree_sum, with_neighbours_added
-from es_service.protocol.messages import GradientChunk, GradientResult, around
+from es_service.protocol.messages import GradientChunk, GradientResult, with_subject
 from tests.es_service.scheduler_play import check_consistency, items, play, ready, step
 from tests.es_service.test_engine import Scripted
 from tests.helpers import centre, random_parameters
@@ -286,8 +286,10 @@ def test_sums_over_neighbouring_blocks_are_counted_once_whichever_copy_answers_f
     with Engine(transport, limits) as engine:
         for generation in range(6):
             chunks = [GradientChunk(generation, block, weights) for block in range(BLOCKS)]
-            found = engine.evaluate(around(POINT, chunks))
-            alone = with_neighbours_added(around(POINT, chunks), [GradientResult(block_of(chunk)) for chunk in chunks])
+            found = engine.evaluate(with_subject(POINT, chunks))
+            alone = with_neighbours_added(
+                with_subject(POINT, chunks), [GradientResult(block_of(chunk)) for chunk in chunks]
+            )
             assert tree_sum(found).tobytes() == tree_sum(alone).tobytes()
             now[0] += rng.choice((0.0, 0.01, 0.5))
         copies_sent.append(transport.copies)

@@ -13,7 +13,7 @@ from es_service.config.tasks import TASKS
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
-from es_service.protocol.messages import TrainingChunk, around
+from es_service.protocol.messages import TrainingChunk, with_subject
 from es_service.protocol.noise import uniforms
 from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
@@ -96,7 +96,7 @@ def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_pat
     row = next(bench_rollouts(["point_maze"], policies=[False], rollouts=["xla"], batches=[8], seconds=0.0))
     assert row["batch"] == 8
     with inline_engine(SPEC, Limits(1, max_start_failures=1)) as engine:
-        assert len(engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))) == 1
+        assert len(engine.evaluate(with_subject(centre(random_parameters()), [TrainingChunk(1, 0)]))) == 1
 
 
 def test_a_reset_that_takes_its_key_for_one_of_jax_is_told_how_to_make_one():

@@ -20,7 +20,7 @@ from es_service.protocol.kept_parents import (
     with_made_policies,
     with_parents,
 )
-from es_service.protocol.messages import Policies, around
+from es_service.protocol.messages import Policies, with_subject
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
 from es_service.protocol.recipes import (
@@ -263,7 +263,7 @@ def test_a_worker_whose_cores_are_processes_gives_them_the_policies():
     found = with_made_policies(work)
     assert [bits(subject.parameters_N_D) for subject, _ in found] == made(work)
     assert found[0][0] is not work[0][0]
-    explicit = around(found[0][0], [PolicyChunk(1, 0), PolicyChunk(1, 1)])
+    explicit = with_subject(found[0][0], [PolicyChunk(1, 0), PolicyChunk(1, 1)])
     assert with_made_policies(explicit) == explicit
     assert with_parents(explicit, KeptParents(0, int)) == explicit
 

@@ -16,7 +16,7 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_cluster import connect, disconnect
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk, WorkerPlace, around
+from es_service.protocol.messages import TrainingChunk, WorkerPlace, with_subject
 from es_service.protocol.process_environment import worker_environment
 from es_service.store.digest import digest_parts
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
@@ -118,7 +118,7 @@ def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
         pytest.raises(EvaluationError, match=r"no_such_task(.|\n)*no worker started in 3 consecutive attempts"),
         ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
-        engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))
+        engine.evaluate(with_subject(centre(random_parameters()), [TrainingChunk(1, 0)]))
 
 
 def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
@@ -127,7 +127,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
         pytest.raises(EvaluationError, match=r"TypeError(.|\n)*TrainingChunk 0 of generation 1 failed in 2 attempts"),
         ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
     ):
-        engine.evaluate(around(centre(wrong), [TrainingChunk(1, 0)]))
+        engine.evaluate(with_subject(centre(wrong), [TrainingChunk(1, 0)]))
 
 
 class Mirror:
@@ -155,7 +155,9 @@ class Mirror:
 
 def mirrored(workers: int, gpus: float = 0.0) -> list[tuple[int, list[str], dict[str, str]]]:
     with ray_engine(spec(), Limits(workers), actor=Mirror, gpus=gpus) as engine:
-        answers = engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)]))
+        answers = engine.evaluate(
+            with_subject(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)])
+        )
     return list({answer[0]: answer for answer in answers}.values())
 
 

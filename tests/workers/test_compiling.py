@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from es_service.loop.policies import policy_work
-from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk, Work, around
+from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk, Work, with_subject
 from tests.helpers import centre, random_parameters, spec
 from tests.workers.test_worker import bits
 from workers.simd.episodes import kernel, rollout
@@ -19,9 +19,9 @@ POINT = centre(random_parameters(1))
 STATISTICS = (np.zeros((20, 2), np.float32), np.ones((20, 2), np.float32))
 POLICIES = np.stack([random_parameters(seed) for seed in range(20)])
 ITEMS: dict[str, list[Work]] = {
-    "training": around(POINT, [TrainingChunk(1, chunk) for chunk in range(2)]),
-    "evaluation": around(POINT, [EvaluationChunk(1, chunk) for chunk in range(2)]),
-    "gradient": around(POINT, [GradientChunk(1, chunk, np.ones(8, np.float32)) for chunk in range(2)]),
+    "training": with_subject(POINT, [TrainingChunk(1, chunk) for chunk in range(2)]),
+    "evaluation": with_subject(POINT, [EvaluationChunk(1, chunk) for chunk in range(2)]),
+    "gradient": with_subject(POINT, [GradientChunk(1, chunk, np.ones(8, np.float32)) for chunk in range(2)]),
     "policies": policy_work(POLICIES, STATISTICS, 1, traces=True, seed=5, generation=9).work,
 }
 """The last chunk of policies has fewer slots."""

@@ -91,7 +91,7 @@ if __name__ == "__main__":
 
     def item(value):
         subject = centre(np.full(1, value), observation_size=0)
-        return pickle.dumps([(0, EvaluationChunk(1, 0))]), pickle.dumps(subject)
+        return pickle.dumps(([], [(0, EvaluationChunk(1, 0))])), pickle.dumps(subject)
 
     with ThreadPoolExecutor(2) as calls:
         first = calls.submit(actor.run, *item(1.0))

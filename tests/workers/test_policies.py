@@ -67,9 +67,9 @@ def test_a_lane_with_weights_of_its_own_has_the_bits_of_a_centre_at_every_width(
         environment = make_environment("point_maze", {})
         own, shared = (
             compile_episodes(
-                environment, worker_spec, np.arange(2), training=False, own_weights=own_weights, target=target
+                environment, worker_spec, np.arange(2), training=False, per_lane_weights=per_lane_weights, target=target
             )
-            for own_weights in (True, False)
+            for per_lane_weights in (True, False)
         )
         found.append(own.run(addresses_L, 0.0, mean_L, std_L, None, keys_L, keys_L))
         for lane, policy in enumerate(owner_L):

@@ -27,7 +27,7 @@ def record(
         make_watched_rollout: as `workers.rollout.make_watched_rollout`.
     """
     environment = environments.make_environment(spec.environment, spec.environment_options)
-    watched = {own: make_watched_rollout(environment, spec, own_weights=own) for own in (False, True)}
+    watched = {own: make_watched_rollout(environment, spec, per_lane_weights=own) for own in (False, True)}
     viewer = environment.viewer
     recordings = tuple(_record(environment, watched, request) for request in requests)
     return Recordings(

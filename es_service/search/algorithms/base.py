@@ -95,14 +95,16 @@ def frozen(state: SearchState) -> SearchState:
     return replace(state, archive=archive, extra=read_only(state.extra))
 
 
-def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
+def from_elite(
+    state: SearchState, index: int, cell: int, elite: Elite, *, elite_statistics: bool = False
+) -> SearchState:
     """The state in which an elite replaces a centre, whose step begins anew.
 
     Args:
         index: index of the centre.
         cell: cell of the elite.
-        own_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else it
-            uses those of the whole run.
+        elite_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else
+            it uses those of the whole run.
     """
     before = state.centres[index]
     centre = CentreState(
@@ -110,8 +112,8 @@ def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_s
         restarted(before.step),
         before.entry,
         cell,
-        elite.observation_mean_O if own_statistics else None,
-        elite.observation_std_O if own_statistics else None,
+        elite.observation_mean_O if elite_statistics else None,
+        elite.observation_std_O if elite_statistics else None,
     )
     return with_centre(state, index, centre)
 

@@ -130,7 +130,7 @@ def me_es(config: RunConfig) -> Algorithm:
             for emitter, objective in enumerate(objectives(state, generation))
         )
 
-    restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
+    restart = counting(partial(from_elite, elite_statistics=search.parent_statistics == "elite"))
     extra = counted_starts(config) if search.cell_sampling == "least_tried" else {}
     return measuring(config, replace(shared, ask=ask, start_cells=start_cells, restart=restart, extra=extra))
 

@@ -128,7 +128,7 @@ def memes(config: RunConfig) -> Algorithm:
     exploits_M = np.array(
         [weight_of_fitness(emitter_objective(search, emitter_index)) > 0.0 for emitter_index in range(search.emitters)]
     )
-    elite_restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
+    elite_restart = counting(partial(from_elite, elite_statistics=search.parent_statistics == "elite"))
     extra = {STAGNANT: np.zeros(search.emitters, np.int64)}
     if search.exploit_generations is not None:
         extra[AGE] = np.zeros(search.emitters, np.int64)

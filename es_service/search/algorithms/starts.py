@@ -85,11 +85,11 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
         neighbours=settings.neighbours,
         distance=settings.distance,
         newest=settings.newest,
-        exclude_Q=_own_entries(map_, archive),
+        exclude_Q=_entries_of_elites(map_, archive),
     )
 
 
-def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
+def _entries_of_elites(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
     """Index of each elite's own entry in the novelty archive, [N]; -1 for an elite without one.
 
     The search relies on the order of the entries: by generation and, within a generation, by centre.

@@ -122,12 +122,12 @@ def hold_episodes_against_x86(task: str, steps: int, hidden: tuple[int, ...], ki
     found = []
     for one in (targets()[0], target):
         made = compile_episodes(
-            environment, worker_spec, np.arange(len(mean_O)), training=training, own_weights=own, target=one
+            environment, worker_spec, np.arange(len(mean_O)), training=training, per_lane_weights=own, target=one
         )
         weights, mean, std = made.network.pack(centre_D), mean_O, std_O
         if own:
             rng = np.random.default_rng(0)
-            kept, weights = made.network.room_for_own(lanes, shape.parameters)
+            kept, weights = made.network.room_for_weights(lanes, shape.parameters)
             kept[...] = centre_D + rng.normal(0, 0.1, kept.shape)
             mean, std = np.tile(mean_O, (lanes, 1)), np.tile(std_O, (lanes, 1))
         of_lanes = (given_.reshape(-1, 4)[:lanes] for given_ in (resets, actions))

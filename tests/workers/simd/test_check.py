@@ -25,7 +25,7 @@ from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.rollout import make_gradient_sum
 from workers.simd.graph.operations import OPERATIONS
 
-KINDS = [{"training": True}, {"training": False}, {"training": False, "own_weights": True}]
+KINDS = [{"training": True}, {"training": False}, {"training": False, "per_lane_weights": True}]
 
 
 @pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)

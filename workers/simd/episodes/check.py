@@ -52,14 +52,14 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     """Raise WrongCodeError unless one step of 16 episodes, after their resets, has the bits of its definition."""
     spec, inputs_O, rng, keys_L = kernel.spec, kernel.inputs_O, np.random.default_rng(0), reset_keys()
     noise_keys_P = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(LANES // 2)) if kernel.training else None
-    lanes_O = (LANES if kernel.own_weights else 1, spec.policy.widths[0])
+    lanes_O = (LANES if kernel.per_lane_weights else 1, spec.policy.widths[0])
     mean_O, std_O = np.zeros(lanes_O, np.float32), rng.uniform(0.5, 2.0, lanes_O).astype(np.float32)
     mean_O[:, inputs_O] = rng.normal(0.0, 0.1, (len(mean_O), len(inputs_O)))
-    parameters_L_D = _parameters(spec, rng, LANES if kernel.own_weights else 1)
-    if kernel.own_weights:
-        memory, weights = kernel.network.room_for_own(LANES, spec.policy.parameters)
+    parameters_L_D = _parameters(spec, rng, LANES if kernel.per_lane_weights else 1)
+    if kernel.per_lane_weights:
+        memory, weights = kernel.network.room_for_weights(LANES, spec.policy.parameters)
         memory[...] = parameters_L_D
-        weights_of = reference.own(memory)
+        weights_of = reference.per_lane(memory)
     elif noise_keys_P is not None and not spec.noise_rank:
         weights_of = reference.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
         weights = kernel.network.pack(parameters_L_D[0])

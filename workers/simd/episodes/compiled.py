@@ -1,7 +1,7 @@
 """Compiled episodes: the program of `program.py` as a function that workers call.
 
 In training, the members of a pair are neighbouring lanes. In evaluations, all lanes have the weights and the
-observation statistics of the centre, or with `own_weights` each lane has its own.
+observation statistics of the centre, or with `per_lane_weights` each lane has its own.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from workers.simd.episodes.program import EpisodeProgram, write_episodes
 @dataclass(frozen=True)
 class EpisodeKernel:
     """Compiled episodes: training episodes of both members of pairs, or evaluation episodes of the centre or, with
-    `own_weights`, of a policy in each lane."""
+    `per_lane_weights`, of a policy in each lane."""
 
     training: bool
-    own_weights: bool
+    per_lane_weights: bool
     spec: WorkerSpec
     inputs_O: np.ndarray
     """Indices of the observations that are computed, as inputs of the policy."""
@@ -154,7 +154,7 @@ class EpisodeKernel:
         ranks = self.low_rank.rank if self.low_rank else 0
         room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors + ranks, width))
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
-        if self.own_weights:
+        if self.per_lane_weights:
             require(len(statistics[0]) == len(weights) == lanes, "each lane must have weights and statistics")
             weights = filled(weights, blocks * width)
             noise = aligned((len(self.network.places) - self.network.vectors, width)).view(np.int8)  # single weights
@@ -169,7 +169,7 @@ class EpisodeKernel:
         places = (self.low_rank or self.network).places
         arrays = (carries, actions, constants, weights, keys, places, noise, room)
         require(
-            [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
+            [array.dtype.char for array in arrays] == list("IIILIIbI" if self.per_lane_weights else "IIIfIIbI")
             and all(array.flags.c_contiguous for array in arrays),
             "they must be contiguous and have the dtypes of the kernel",
         )
@@ -188,7 +188,7 @@ def compile_episodes(
     inputs_O: np.ndarray,
     *,
     training: bool,
-    own_weights: bool = False,
+    per_lane_weights: bool = False,
     target: Target | None = None,
     folder: Path | None = None,
     check: Callable[[EpisodeKernel, EpisodeProgram], object] = lambda kernel, program: None,
@@ -199,7 +199,7 @@ def compile_episodes(
     Args:
         inputs_O: indices of the observations that are computed; others are always zero.
         training: training episodes, or else evaluation episodes.
-        own_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
+        per_lane_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
         check, check_resets: functions that raise an exception if new code is wrong; see check.py.
@@ -209,14 +209,14 @@ def compile_episodes(
         NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
-    program = write_episodes(environment, spec, inputs_O, target, training=training, own_weights=own_weights)
+    program = write_episodes(environment, spec, inputs_O, target, training=training, per_lane_weights=per_lane_weights)
     begin = compile_resets(program.steps.begin, target, folder, check_resets)
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 
     def kernel(native: Native) -> EpisodeKernel:
         return EpisodeKernel(
             training=training,
-            own_weights=own_weights,
+            per_lane_weights=per_lane_weights,
             spec=spec,
             inputs_O=inputs_O,
             network=program.network,

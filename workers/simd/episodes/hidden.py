@@ -7,7 +7,7 @@ shared: from the centre, for all members.
 perturbed: the weights of + are (centre + unit) + 2 unit j, and those of - are 2 centre minus that weight, its mirror
     image up to a rounding. The members of a pair share the bytes j of their noise k = 2 j + 1. The weights of + are
     computed in each step or, if the network is small (`Network.keeps_weights`), once per episode by `keep_function`.
-own: from the parameters of each member.
+per_lane: from the parameters of each member.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _weights_of_plus(builder: FunctionBuilder, centre: str, places: Sequence[str
     return [builder.fma(noise_of_weights(builder, "%noise", place), twice, moved) for place in places]
 
 
-def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
+def per_lane(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
     """Write out = f(weights x) with the parameters of each member, whose addresses are in `%weights`.
 
     A weight is used once per call, so memory is the bottleneck. A tile is therefore as wide as the registers allow,

@@ -103,7 +103,7 @@ class Network(NamedTuple):
         weights.reshape(-1)[self.vectors * self.width :][: len(single)] = padded_D[single]
         return weights
 
-    def room_for_own(self, policies: int, parameters: int) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
+    def room_for_weights(self, policies: int, parameters: int) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
         """Room for policies of kernels with own weights: (their parameters [N, D], the address of each one's).
 
         The array must live as long as the addresses are used.

@@ -16,12 +16,12 @@ from collections.abc import Callable
 from typing import Literal
 
 from workers.simd.backend.function_builder import FunctionBuilder, Values
-from workers.simd.episodes.hidden import View, activated, first_sums, own, perturbed, shared, units
+from workers.simd.episodes.hidden import View, activated, first_sums, per_lane, perturbed, shared, units
 from workers.simd.episodes.layout import Network
 from workers.simd.episodes.low_rank import LowRankNoise, begins_of_hidden, begins_of_last, thin_sums
 from workers.simd.episodes.noise import by_sign, noise_of_weights
 
-Weights = Literal["shared", "perturbed", "own"]
+Weights = Literal["shared", "perturbed", "per_lane"]
 """Where the weights of a member are from; see `hidden.py`."""
 OUTPUTS_AT_ONCE = 4
 """Most outputs of the last layer that are computed in one loop over its inputs."""
@@ -32,7 +32,7 @@ def policy_function(network: Network, weights: Weights, low_rank: LowRankNoise |
 
         shared                          ptr centre
         perturbed, or with low_rank     ptr centre, ptr noise, float unit
-        own                             ptr weights, ptr places, ptr singles
+        per_lane                        ptr weights, ptr places, ptr singles
 
     x is [input, lane] and action [output, lane]. `alive` has a word for each lane; hidden layers are not computed for a
     group of neighbouring lanes that are all 0. centre is an array of `Network.pack`, noise one of
@@ -45,7 +45,7 @@ def policy_function(network: Network, weights: Weights, low_rank: LowRankNoise |
     """
     width = network.width
     noisy = ["noise"] * (weights == "perturbed" or low_rank is not None)
-    given = ["weights", "places", "singles"] if weights == "own" else ["centre", *noisy]
+    given = ["weights", "places", "singles"] if weights == "per_lane" else ["centre", *noisy]
     parameters = [*(f"ptr noalias %{name}" for name in ("x", "alive", *given)), *["float %unit"] * len(noisy)]
     builder = FunctionBuilder("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], network.target)
     buffers = [builder.at("%hidden", half * network.hidden_vectors // 2, builder.llvm_types["f"]) for half in range(3)]
@@ -65,7 +65,7 @@ def policy_function(network: Network, weights: Weights, low_rank: LowRankNoise |
         elif weights == "perturbed":
             perturbed(builder, network, layer, view, out)
         else:
-            own(builder, layer, view, out)
+            per_lane(builder, layer, view, out)
         view = out
     seen = view.pointer
     if network.hidden and not low_rank:
@@ -120,7 +120,7 @@ def _last(
         begins: function (outputs, their biases) -> first values of their sums.
     """
     floats, count = builder.llvm_types["f"], network.outputs
-    singles = "" if weights == "own" else builder.at("%centre", network.vectors * builder.width, "float")
+    singles = "" if weights == "per_lane" else builder.at("%centre", network.vectors * builder.width, "float")
 
     def centre(row: str | int) -> Values:
         return [
@@ -128,10 +128,10 @@ def _last(
             for output in outputs
         ]
 
-    def own_weights(row: str | int) -> Values:
+    def per_lane_weights(row: str | int) -> Values:
         return [builder.load(floats, "%singles", builder.index((row, count), (output, 1))) for output in outputs]
 
-    of_row = own_weights if weights == "own" else centre
+    of_row = per_lane_weights if weights == "per_lane" else centre
     if weights == "perturbed":
         noise = builder.at("%noise", network.vectors * (builder.width // 2) * builder.width, "i8")
         unit, twice = (by_sign(builder, vector) for vector in units(builder))

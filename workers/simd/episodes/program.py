@@ -2,7 +2,7 @@
 
 In training, the members of a pair are neighbouring lanes. The data of a block fits in the cache of a core: the noise of
 its pairs (one byte per parameter), the centre, and the state of its episodes. In evaluations, all lanes have the
-weights and the observation statistics of the centre, or with `own_weights` each lane has its own.
+weights and the observation statistics of the centre, or with `per_lane_weights` each lane has its own.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def write_episodes(
     target: Target,
     *,
     training: bool,
-    own_weights: bool = False,
+    per_lane_weights: bool = False,
 ) -> EpisodeProgram:
     """Program of a run's episodes for a target, which need not be this processor; `compile_episodes` compiles it.
 
@@ -74,7 +74,7 @@ def write_episodes(
         UnsupportedError: a step of the environment cannot be compiled. `text` of the result may raise it as well.
     """
     rank = spec.noise_rank if training else 0
-    weights: Weights = "perturbed" if training and not rank else "own" if own_weights else "shared"
+    weights: Weights = "perturbed" if training and not rank else "per_lane" if per_lane_weights else "shared"
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, target)
     low_rank = plan_noise(spec.policy, rank, inputs_O, network.hidden, target.width) if rank else None
@@ -104,7 +104,7 @@ def write_episodes(
         return _module(*graphs(), network, low_rank, len(inputs_O), words, alive_word, weights, kept)
 
     digests = f"{definition()} {jaxpr_digest(normalised_observation)} {jaxpr_digest(advance)}"
-    kind = f"{training}{' own' * own_weights}{f' rank {rank}' if rank else ''}"
+    kind = f"{training}{' own' * per_lane_weights}{f' rank {rank}' if rank else ''}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {kind}"
     return EpisodeProgram(steps, carry, alive_word, network, low_rank, of_steps, name, text, graphs)
 
@@ -147,8 +147,8 @@ def _module(
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
     advance_code = graph_function("move", graph, outputs, sources, "carry", target)
     policy_code = policy_function(network, weights, low_rank)
-    own, noisy, keeps = weights == "own", weights == "perturbed" or low_rank is not None, False
-    before = [singles_function(network)] if own else []
+    per_lane, noisy, keeps = weights == "per_lane", weights == "perturbed" or low_rank is not None, False
+    before = [singles_function(network)] if per_lane else []
     if noisy:
         layout = low_rank or network
         before.append(fill_function(layout.vectors, len(layout.places) - layout.vectors, target))
@@ -167,10 +167,10 @@ def _module(
         carry = builder.at("%carries", builder.index((number, words)), vector)
         action_key = builder.at("%action_keys", builder.index((number, KEY_WORDS)), vector)
         alive = builder.at(carry, alive_word, vector)
-        constants = builder.at("%constants", builder.index((number, 2 * inputs)), vector) if own else "%constants"
-        policies = builder.at("%centre", builder.index((number, width)), "i64") if own else "%centre"
-        given = "ptr %places, ptr %noise, " if own else "ptr %noise, float %unit, " if noisy else ""
-        if own:
+        constants = builder.at("%constants", builder.index((number, 2 * inputs)), vector) if per_lane else "%constants"
+        policies = builder.at("%centre", builder.index((number, width)), "i64") if per_lane else "%centre"
+        given = "ptr %places, ptr %noise, " if per_lane else "ptr %noise, float %unit, " if noisy else ""
+        if per_lane:
             builder.do(f"call void @singles(ptr {policies}, ptr %places, ptr %noise)")
         if noisy:
             keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")

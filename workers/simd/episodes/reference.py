@@ -64,7 +64,7 @@ def shared(centre_D: Floats, lanes: int) -> WeightsOf:
     return lambda places, last: np.broadcast_to(centre_D[places][:, None], (len(places), lanes))
 
 
-def own(parameters_L_D: Floats) -> WeightsOf:
+def per_lane(parameters_L_D: Floats) -> WeightsOf:
     """Weights of each lane's own parameters."""
     return lambda places, last: parameters_L_D[:, places].T
 

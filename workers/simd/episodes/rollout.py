@@ -117,13 +117,13 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
 def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
     lanes."""
-    kernels = _Kernels(environment, spec, training=False, own_weights=True)
+    kernels = _Kernels(environment, spec, training=False, per_lane_weights=True)
 
     make = make_variation()
 
     def rollout(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernel = kernels.fitting(mean_L_O)
-        rows, addresses_N = kernel.network.room_for_own(sum(map(len, policies)), spec.policy.parameters)
+        rows, addresses_N = kernel.network.room_for_weights(sum(map(len, policies)), spec.policy.parameters)
         for first, parameters_N_D in zip(accumulate(map(len, policies), initial=0), policies, strict=False):
             part = rows[first : first + len(parameters_N_D)]
             if isinstance(parameters_N_D, Recipes):
@@ -143,7 +143,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     return Compilable(rollout, compile_for)
 
 
-def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weights: bool) -> Callable[..., Carry]:
+def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, per_lane_weights: bool) -> Callable[..., Carry]:
     """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout`.
 
     An episode's bits depend neither on its slot nor on whether its weights are those of a centre or of a policy.
@@ -164,10 +164,10 @@ class _Kernels:
     """
 
     def __init__(
-        self, environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False
+        self, environment: Environment, spec: WorkerSpec, *, training: bool, per_lane_weights: bool = False
     ) -> None:
         self._environment, self._spec = environment, spec
-        self._training, self._own_weights = training, own_weights
+        self._training, self._per_lane_weights = training, per_lane_weights
         self._zero_O = always_zero(environment)
         if self._zero_O.all():
             self._zero_O[0] = False
@@ -192,7 +192,7 @@ class _Kernels:
                         self._spec,
                         inputs_O,
                         training=self._training,
-                        own_weights=self._own_weights,
+                        per_lane_weights=self._per_lane_weights,
                         check=check_episodes,
                         check_resets=partial(check_resets, environment=self._spec.environment),
                     )
