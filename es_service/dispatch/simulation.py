@@ -37,7 +37,9 @@ class Costs:
     """Kind of chunk -> time from the end of sending until the worker begins, and as much again from its end until the
     answer arrives."""
     driver_s: float
-    """Time of the driver in a generation for everything else: the search and the store."""
+    """Time of the driver in a generation for the search, while no worker computes."""
+    beside_s: float = 0.0
+    """Time of the driver and the store for what they do while the first phase computes, such as a commit."""
     chunk_message_s: Mapping[str, float] = field(default_factory=dict)
     """Kind of chunk -> further time of the driver for each chunk of a work item but the first; 0 if it is not named."""
 
@@ -109,9 +111,11 @@ def predict(
     cluster = _Cluster(state, costs, seconds_of, clock)
     taken: dict[str, float] = {}
     for generation in range(ROUNDS):
-        for phase in phases:
+        for number, phase in enumerate(phases):
             begun = cluster.now
             cluster.play(phase, generation)
+            if number == 0:
+                cluster.now = max(cluster.now, begun + costs.beside_s)
             taken[phase.name] = cluster.now - begun
         cluster.now += costs.driver_s
     return _judge(phases, costs, actors * cores, taken)

@@ -6,7 +6,7 @@ import pickle
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import cycle, islice
@@ -28,7 +28,7 @@ from es_service.loop import driver
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
 from es_service.loop.history import evaluated_columns, history_columns
-from es_service.protocol.evaluator import DispatchCounts, Evaluator
+from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
@@ -61,7 +61,7 @@ GENERATIONS = 12
 """Generations of the loop with replayed results; the first third does not count."""
 PAST_ENTRIES = 5000
 """Entries of the novelty archive before the first of these generations."""
-REPLAYED, SCATTER = 64, 0.05
+REPLAYED, SCATTER = 2048, 0.05
 """Different answers of each kind, and the standard deviation of an answer's descriptors as a share of their range."""
 UNBOUNDED = 1e3
 """In the place of a bound of the descriptor that is larger."""
@@ -83,7 +83,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     initial = [(centres[0], chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
     chunk_s, answers = _chunk_costs(spec, [*works, initial])
     message_s, way_s, chunk_message_s = _message_costs(spec, works, answers)
-    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers), chunk_message_s)
+    costs = Costs(chunk_s, message_s, way_s, *_driver_cost(config, answers), chunk_message_s)
     steps = _steps(search, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
@@ -261,13 +261,27 @@ class _Replay:
     counts = DispatchCounts(workers=1)
 
     def __init__(self, answers: Mapping[str, ChunkResult], random: np.random.Generator, bounds_B_2: np.ndarray) -> None:
+        self.beside_s = self.replay_s = 0.0
+        """Time so far of what the driver does while rollouts compute, and of this evaluator itself."""
         self._answers = {
             kind: cycle([_moved(answer, random, bounds_B_2) for _ in range(REPLAYED)])
             for kind, answer in answers.items()
         }
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        return [_of_slots(next(self._answers[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work]
+        began = time.perf_counter()
+        results = [_of_slots(next(self._answers[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work]
+        self.replay_s += time.perf_counter() - began
+        return results
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        began = time.perf_counter()
+
+        def wait() -> list[ChunkResult]:
+            self.beside_s += time.perf_counter() - began
+            return self.evaluate(work)
+
+        return wait
 
 
 def _of_slots(answer: ChunkResult, subject: Subject, chunk: Chunk) -> ChunkResult:
@@ -318,8 +332,8 @@ def _search(config: RunConfig) -> driver.Search:
     )
 
 
-def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
-    """Seconds of a generation in which only the driver and the store work."""
+def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple[float, float]:
+    """Seconds of a generation in which only the driver works, and those that it and the store need beside rollouts."""
     config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
     search = _search(config)
     task = search.task
@@ -327,7 +341,6 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float
     if isinstance(config.search, PopulationConfig):  # with policies, only the first ones enter the archive
         past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
         search = replace(search, algorithm=_with_past(search.algorithm, past_N_B))
-    ends: list[float] = []
     meta = RunMeta(
         run_id="measurement",
         created="",
@@ -337,14 +350,19 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float
         columns=history_columns(task, config.map.enabled, config.map.correct_every is not None),
         evaluation_columns=evaluated_columns(task, config.map.enabled),
     )
-    replay: Evaluator = _Replay(answers, random, bounds_B_2)
+    replay, times = _Replay(answers, random, bounds_B_2), list[tuple[float, float]]()
+
+    def ended(_: object) -> None:
+        passed_s = time.perf_counter() - replay.beside_s - replay.replay_s
+        times.append((passed_s, replay.beside_s))
+
     with (
         tempfile.TemporaryDirectory() as folder,
         RunStore.create(Path(folder) / "run", config.resolved_yaml(), meta, Beginning()) as store,
     ):
-        driver.run(search, replay, store, None, lambda _: ends.append(time.perf_counter()))
-    seconds = np.diff(ends)[GENERATIONS // 3 :]
-    return float(np.median(seconds))
+        driver.run(search, replay, store, None, ended)
+    driver_s, beside_s = np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0)
+    return float(driver_s), float(beside_s)
 
 
 def _budget() -> dict[str, Any]:

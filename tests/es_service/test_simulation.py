@@ -51,6 +51,14 @@ def test_messages_cost_the_driver_time_and_the_worker_time_on_their_way():
     assert behind.limit == "the driver"
 
 
+def test_what_the_driver_does_beside_rollouts_counts_as_far_as_it_takes_longer_than_they_do():
+    paid = replace(costs(), beside_s=3.0)
+    assert predicted(generation(8, 2, 2), paid, 1).seconds == pytest.approx(8.0 + 0.2 + 1.0)
+    hurried = predicted(generation(8, 2, 2), paid, 8)
+    assert hurried.seconds == pytest.approx(3.0 + 0.1 + 0.5)
+    assert hurried.limit == "the driver"
+
+
 def test_each_further_chunk_of_an_item_may_cost_the_driver_time():
     """A worker with eight cores takes eight chunks in a work item."""
     paid = replace(costs(message_s=0.02), chunk_message_s={"TrainingChunk": 0.1})
