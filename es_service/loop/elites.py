@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +11,8 @@ from es_service.loop.parts import ELITE_PREFIX, Changes, elite_from_arrays, elit
 from es_service.protocol.kept import Kept
 from es_service.search.maps.behaviour_map import Elite
 
-RECENT_BYTES = 128 * 2**20
-"""Most bytes that are kept of elites that the store has."""
+RECENT_BYTES = 256 * 2**20
+"""Most bytes that are kept of elites that the store has: 400 of an ant with a 256x256 policy are 155 MB."""
 
 
 class Elites:
@@ -37,13 +37,16 @@ class Elites:
         """The elites of cells. Raises KeyError if there is none in one of them."""
         kept, new = self._kept, self._new
         kept.use(cells)
-        return {cell: (new[cell] if cell in new else kept.get(cell)) or self._read(cell) for cell in cells}
+        asked = dict.fromkeys(cells)
+        return {cell: (new[cell] if cell in new else kept.get(cell)) or self._read(cell, asked) for cell in asked}
 
-    def _read(self, cell: int) -> Elite:
-        """An elite that is only in the store."""
+    def _read(self, cell: int, asked: Collection[int]) -> Elite:
+        """An elite that is only in the store. It takes the place of none that was asked for with it: a batch of mutants
+        asks for nearly the whole map, and if that is too large, each elite would otherwise be gone when it is needed.
+        """
         if cell in self._new:
             raise KeyError(cell)
-        return self._keep(cell, _read_only(elite_from_arrays(self._part(elite_part(cell)))))
+        return self._keep(cell, _read_only(elite_from_arrays(self._part(elite_part(cell)))), asked)
 
     def change(self, parts: Changes) -> None:
         """Take in what a generation has changed, before it is stored."""
@@ -60,10 +63,12 @@ class Elites:
                 self._keep(cell, elite)
         self._new.clear()
 
-    def _keep(self, cell: int, elite: Elite) -> Elite:
-        """Keep an elite as the newest, and forget those that were not asked for the longest."""
+    def _keep(self, cell: int, elite: Elite, spared: Collection[int] = ()) -> Elite:
+        """Keep an elite as the newest, and forget those that were not asked for the longest, or else this one."""
         self._kept.add(cell, elite)
-        self._kept.forget_oldest(self._most_bytes)
+        self._kept.forget_oldest(self._most_bytes, spared=spared)
+        if self._kept.nbytes > self._most_bytes:
+            self._kept.forget(cell)
         return elite
 
 

@@ -18,6 +18,11 @@ class Kept(Mapping[Key, Value], Generic[Key, Value]):
         self._kept: dict[Key, Value] = {}
         self._size_of, self._bytes = size_of, 0
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all values."""
+        return self._bytes
+
     def add(self, key: Key, value: Value) -> None:
         """Keep a value as the newest, in the place of the one that had this key."""
         self.forget(key)

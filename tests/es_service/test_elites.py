@@ -40,6 +40,17 @@ def test_an_elite_that_was_read_needs_no_other_reading_until_there_is_no_room(st
     assert store.read == [elite_part(cell) for cell in (0, 1, 2, 3, 1)]  # 1 was not asked for the longest
 
 
+def test_of_a_map_larger_than_the_room_only_the_rest_is_read_again(store):
+    """As a batch of mutants asks for it, generation after generation."""
+    elites = Elites(store.part, most_bytes=3 * KILOBYTE)
+    for _ in range(3):
+        assert [found.centre_D[0] for found in elites.of([0, 1, 2, 3, 4, 4]).values()] == [0, 1, 2, 3, 4]
+    assert store.read == [elite_part(cell) for cell in (0, 1, 2, 3, 4, *(3, 4) * 2)]
+    elites.of([3, 4])
+    assert elites(4).centre_D[0] == 4
+    assert store.read[9:] == [elite_part(cell) for cell in (3, 4)], "others make room for what alone is asked for"
+
+
 def test_an_elite_larger_than_the_room_is_read_each_time(store):
     store.parts[elite_part(0)] = elite_to_arrays(elite(0, kilobytes=4))
     elites = Elites(store.part, most_bytes=3 * KILOBYTE)
