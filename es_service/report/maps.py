@@ -264,9 +264,9 @@ def path_lines(data: RunData) -> dict[str, Any]:
         inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
         lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
         script_data["detours"] = {
-            str(cell): [[at, _way(frame, places)] for at, places in around.items()]
+            str(cell): [[at, _way(frame, places)] for at, places in detours_at.items()]
             for cell, inside_T_B in zip(known, inside_N_T_B, strict=True)
-            if (around := detours(inside_T_B, data.task, map_.geometry.bounds))
+            if (detours_at := detours(inside_T_B, data.task, map_.geometry.bounds))
         }
         return script_data | {"points": points, "paths": packed(TENTHS * lines, "int16")}
     time, shown = _path_frame(data), min(len(data.names), PAIRED_DIMENSIONS)

@@ -125,12 +125,12 @@ def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None,
         cell = map_.geometry.index_of(int(map_.cell_N[map_.fitness_N.argmax()]))
     _plane(data, axes)
     path_T_2 = opened.elite(cell).trace_T_B
-    around = detours(path_T_2, data.task, data.bounds)
-    gaps = [at + 1 for at in around]
+    detours_at = detours(path_T_2, data.task, data.bounds)
+    gaps = [at + 1 for at in detours_at]
     [line] = axes.plot(
         *np.insert(path_T_2, gaps, np.nan, axis=0).T, **{"color": PATH, "linewidth": 1.4, "zorder": 4} | style
     )
-    for at, place_N_2 in around.items():
+    for at, place_N_2 in detours_at.items():
         if len(place_N_2):
             [dashed] = axes.plot(*np.concatenate([path_T_2[at, None], place_N_2, path_T_2[at + 1, None]]).T)
             dashed.update_from(line)

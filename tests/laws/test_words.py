@@ -28,6 +28,17 @@ REPLACED = {
     r"\bsolutions?\b": "policy or centre",
 }
 """A word that is not used -> what is written instead."""
+NAMES = {
+    "around": "with_subject",
+    "bystander": "charge_item",
+    "own_statistics": "per_lane_statistics, elite_statistics",
+    "own_weights": "per_lane_weights",
+    "standing": "run_status",
+    "twin": "reference",
+    "unfit": "problem",
+    "way_on": "how_to_continue",
+}
+"""A name of functions, arguments, attributes or variables that is not used -> what has its place."""
 MEMBERS = {"task.episodes_per_member", "invalid_members"}
 """Names that speak of members, the perturbed policies of a population."""
 
@@ -65,3 +76,12 @@ def test_messages(path: Path) -> None:
     for text in texts:
         if id(text) not in documents:
             assert replaced(text.value) == [], text.value
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_names(path: Path) -> None:
+    names = set[str]()
+    for node in ast.walk(ast.parse(path.read_text())):
+        given = (getattr(node, field, None) for field in ("id", "arg", "attr", "name", "asname"))
+        names |= {name.lower().lstrip("_") for name in given if isinstance(name, str)}
+    assert {name: NAMES[name] for name in names & NAMES.keys()} == {}
