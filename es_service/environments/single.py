@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
@@ -45,7 +46,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self.task = self._lanes.task
         self.observation_space, self.action_space = observation_space(self.task), action_space(self.task)
         self._trails = None if render_mode is None else Trails(self.task, 1)
-        self._is_seeded = False
+        self._is_seeded = self._is_closed = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -67,10 +68,15 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return seen.observation[0], self._info(seen)
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Step with an action [A]. Raises ValueError if it has another shape."""
+        """Step with an action [A]. Raises ValueError if it has another shape, or before the first reset, and
+        ClosedEnvironmentError after `close`."""
+        if self._is_closed:
+            raise ClosedEnvironmentError("the environment is closed; make another one")
         action_A = np.asarray(action, np.float32)
         if action_A.shape != self.action_space.shape:
             raise ValueError(f"action has the shape {action_A.shape}; must be {self.action_space.shape}")
+        if not self._is_seeded:
+            raise ValueError("call reset before step")
         seen = self._lanes.step(action_A[None])
         if self._trails is not None:
             self._trails.move(_FIRST, seen.descriptor)
@@ -93,6 +99,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         """End the process of a task that xla computes."""
+        self._is_closed = True
         self._lanes.close()
 
     def _info(self, seen: Seen) -> dict[str, Any]:

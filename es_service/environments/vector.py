@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
@@ -121,7 +122,10 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises:
             ValueError: the actions have another shape, or an episode is over that the caller has to reset.
+            ClosedEnvironmentError: the environments are closed.
         """
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; make others")
         action_N_A = np.asarray(actions, np.float32)
         if action_N_A.shape != self.action_space.shape:
             raise ValueError(f"actions have the shape {action_N_A.shape}; must be {self.action_space.shape}")

@@ -13,6 +13,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_match import check_environments_match
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -306,11 +307,22 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
         (lambda: many().reset(options={"reset_mask": [True]}), TypeError, "is list; must be a NumPy"),
         (lambda: many().reset(options=MASK), ValueError, OF_BOOLS),
         (lambda: TaskEnv("point_maze").step([0.0]), ValueError, r"the shape \(1,\); must be \(2,\)"),
+        (lambda: TaskEnv("point_maze").step([0.0, 0.0]), ValueError, "call reset before step"),
     ],
 )
 def test_a_wrong_argument_is_an_error_that_says_what_is_allowed(call, error, sentence):
     with pytest.raises(error, match=sentence):
         call()
+
+
+@pytest.mark.parametrize("made", [lambda: many(), lambda: TaskEnv("point_maze")])
+def test_closed_environments_do_not_step(made):
+    envs = made()
+    envs.reset(seed=0)
+    envs.step(envs.action_space.sample())
+    envs.close()
+    with pytest.raises(ClosedEnvironmentError, match="closed; make"):
+        envs.step(envs.action_space.sample())
 
 
 def test_observations_are_new_arrays_unless_one_is_asked_for_that_is_reused():
