@@ -10,9 +10,9 @@ from operator import attrgetter
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from es_service.protocol.kept_parents import KeptParents, as_sent, is_of_recipes, parents_to_send
+from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce
-from es_service.protocol.messages import FloatArray, Subject, Work
+from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
 from es_service.protocol.recipes import Origin
 
 IN_CALL_BYTES = 64 * 2**10
@@ -115,7 +115,7 @@ class Arguments:
             kept: see `parents_to_send`.
         """
         subjects = {id(subject): subject for subject, _ in work}
-        of_recipes = {key: subject for key, subject in subjects.items() if is_of_recipes(subject)}
+        of_recipes = {key: subject for key, subject in subjects.items() if recipes_in(subject) is not None}
         others = {key: self._subjects.of(subject) for key, subject in subjects.items() if key not in of_recipes}
         self._subjects.forget_old()
         index = {key: number for number, key in enumerate([*of_recipes, *others])}

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.kept import Kept
-from es_service.protocol.messages import Subject, Work
+from es_service.protocol.messages import Subject, Work, recipes_in
 from es_service.protocol.policies import Policies
 from es_service.protocol.recipes import Origin, Recipes, origin_of
 
@@ -70,7 +70,7 @@ def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes,
         kept: sizes of those that the worker has; now with the others.
     """
     needed: dict[bytes, FloatArray] = {}
-    for recipes in _recipes_in(work):
+    for recipes in _recipes_of(work):
         needed.update(zip(recipes.names, recipes.parents, strict=True))
     sent: dict[bytes, FloatArray | Origin] = {}
     for name, parameters_D in needed.items():
@@ -123,7 +123,7 @@ def with_parents(work: Sequence[Work], kept: KeptParents[FloatArray]) -> list[Wo
     Raises:
         LackingError: the worker lacks some.
     """
-    if not (all_recipes := list(_recipes_in(work))):
+    if not (all_recipes := list(_recipes_of(work))):
         return list(work)
     if any(name not in kept for recipes in all_recipes for name in recipes.names):
         raise LackingError
@@ -144,20 +144,15 @@ def as_sent(subject: Subject) -> Subject:
     return _with(subject, Recipes.as_sent)
 
 
-def is_of_recipes(subject: Subject) -> bool:
-    """Whether a subject is policies that are made of recipes."""
-    return isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes)
-
-
-def _recipes_in(work: Sequence[Work]) -> Iterator[Recipes]:
+def _recipes_of(work: Sequence[Work]) -> Iterator[Recipes]:
     """The recipes of a work item's subjects, each once, in their order."""
     for subject in {id(subject): subject for subject, _ in work}.values():
-        if isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes):
-            yield subject.parameters_N_D
+        if (recipes := recipes_in(subject)) is not None:
+            yield recipes
 
 
 def _with(subject: Subject, change: Callable[[Recipes], Recipes | FloatArray]) -> Subject:
     """A subject with a function of its recipes in their place, if it has any."""
-    if isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes):
-        return replace(subject, parameters_N_D=change(subject.parameters_N_D))
+    if isinstance(subject, Policies) and (recipes := recipes_in(subject)) is not None:
+        return replace(subject, parameters_N_D=change(recipes))
     return subject

@@ -18,6 +18,7 @@ from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.protocol.policy_spec import PolicySpec
+from es_service.protocol.recipes import Recipes
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
@@ -226,6 +227,12 @@ Work = tuple[Subject, Chunk]
 """A chunk with the subject that it belongs to."""
 FAILURES_TOLD = 16
 """Most failed episodes that the result of a chunk names."""
+
+
+def recipes_in(subject: Subject) -> Recipes | None:
+    """The recipes by which a subject's policies are made; None for others, whose parameters travel."""
+    given = subject.parameters_N_D if isinstance(subject, Policies) else None
+    return given if isinstance(given, Recipes) else None
 
 
 def with_subject(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:

@@ -22,6 +22,7 @@ from es_service.protocol.messages import (
     PolicyChunk,
     Subject,
     Work,
+    recipes_in,
 )
 from es_service.protocol.policies import slots
 from es_service.protocol.recipes import Recipes
@@ -72,7 +73,7 @@ def together(work: Sequence[Work], most: int) -> list[Work]:
     sent: dict[int, Subject] = {}  # by `id`, since chunks with the same policies share them
     merged = []
     for group in groups:
-        (subject, chunk), recipes = group[0], [_recipes(its_subject) for its_subject, _ in group]
+        (subject, chunk), recipes = group[0], [recipes_in(its_subject) for its_subject, _ in group]
         if id(subject) not in sent:
             sent[id(subject)] = subject
             if isinstance(subject, Policies) and recipes[0] is not None:
@@ -95,7 +96,7 @@ def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
 def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
     """Whether the policies of a chunk are the next ones after those of a group."""
     (subject, chunk), (before, last) = work, group[-1]
-    recipes, earlier = _recipes(subject), _recipes(before)
+    recipes, earlier = recipes_in(subject), recipes_in(before)
     return (
         recipes is not None
         and earlier is not None
@@ -109,11 +110,6 @@ def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
         and chunk == replace(last, chunk_id=last.chunk_id + 1)
         and chunk == PolicyChunk(chunk.generation, chunk.chunk_id, chunk.ask)
     )
-
-
-def _recipes(subject: Subject) -> Recipes | None:
-    given = subject.parameters_N_D if isinstance(subject, Policies) else None
-    return given if isinstance(given, Recipes) else None
 
 
 def _first(subject: Subject) -> int:
