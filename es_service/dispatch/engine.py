@@ -233,6 +233,7 @@ class Engine(Generic[AnyTransport]):
         most = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
         self._work, self._results = {item_id: together(part, most) for item_id, part in parts}, {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
+        self._tell_waits()
 
         def wait() -> list[ChunkResult]:
             while pending(self._state):
@@ -284,6 +285,9 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
             self._step(events.Tick(self.transport.silent()))
+        self._tell_waits()
+
+    def _tell_waits(self) -> None:
         self._waits.tell(self._state, time.monotonic(), self.transport.shortage)
 
     def _handle(self, message: Message) -> None:

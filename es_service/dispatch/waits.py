@@ -23,8 +23,8 @@ class Waits:
         Args:
             on_wait: called with `Transport.shortage` when work has waited for a first place for NOTICE_S seconds, and
                 with "" when that wait is over.
-            on_compile: called with a kind of chunks when SILENCE_S seconds of a phase have passed and none of this kind
-                has been computed so far, since workers start and compile; and with "" when one has been computed.
+            on_compile: called with a kind of chunks when SILENCE_S seconds of a phase have passed and the first workers
+                start or compile for this kind; and with "" when one of them has compiled.
         """
         self._on_wait, self._waits = on_wait, False
         self._on_compile, self._compiles = on_compile, ""
@@ -44,7 +44,14 @@ class Waits:
             self._on_wait(shortage() if waits else "")
         compiles = ""
         if since_s is None and now >= self._begun_s + SILENCE_S:
-            compiles = next((kind for kind in self._kinds if kind not in state.durations_s), "")
+            compiles = next((kind for kind in self._kinds if _compiles_for(state, kind)), "")
         if compiles != self._compiles:
             self._compiles = compiles
             self._on_compile(compiles)
+
+
+def _compiles_for(state: SchedulerState, kind: str) -> bool:
+    """Whether nobody has compiled for this kind so far, and a worker does so or none is up."""
+    if kind in state.durations_s or any(kind in worker.warm for worker in state.up.values()):
+        return False
+    return not state.up or any(worker.slots and worker.slots[0].item.kind == kind for worker in state.up.values())

@@ -44,8 +44,10 @@ def test_a_wait_is_told_when_it_begins_and_when_it_ends():
     assert at(10.0, work) == at(10.0 + 0.9 * SILENCE_S, WorkerUp(0)) == []
     assert at(10.0 + SILENCE_S) == [("compile", KINDS[0])]
     assert at(20.0) == []
-    assert at(21.0, Compiled(0, KINDS[0], 5.0), Result(0, KINDS[0], 1)) == [("compile", KINDS[1])]
-    assert at(22.0, Compiled(0, KINDS[1], 0.9), Result(0, KINDS[1], 1)) == [("compile", "")]
+    assert at(21.0, Compiled(0, KINDS[0], 5.0)) == [("compile", "")]
+    assert at(22.0) == [], "it computes"
+    assert at(23.0, Result(0, KINDS[0], 1)) == [("compile", KINDS[1])]
+    assert at(24.0, Compiled(0, KINDS[1], 0.9), Result(0, KINDS[1], 1)) == [("compile", "")]
     what.begin(KINDS, 30.0)
     assert at(30.0, work) == at(30.0 + 2 * SILENCE_S) == [], "it computes, which a deadline limits"
 
