@@ -118,11 +118,11 @@ def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
         # Two observations are summed in an episode of two steps; what is not the first is that after one step.
         ours = np.asarray(found.shifted_sum_O[:, s, 0], np.float64) - first_P_O
         np.testing.assert_allclose(ours[:, :15], second_P_O[:, :15], rtol=1e-6, atol=1e-6)
-        # A foot that lands magnifies the last bit: most ants are within 1e-6 of the greatest velocity (simd, whose sums
-        # have another order, 3e-6), one within 2e-5.
+        # A foot that lands magnifies the last bit, which depends on the processor: Brax itself, from starts that differ
+        # in it, differs by up to 4e-5 of the greatest velocity, and 7e-6 in the median.
         off_P = np.abs(ours - second_P_O)[:, 15:].max(1) / np.abs(second_P_O[:, 15:]).max()
-        assert np.median(off_P) < (1e-6 if make_training_rollout is xla.make_training_rollout else 5e-6)
-        assert off_P.max() < 3e-5
+        assert np.median(off_P) < 2e-5
+        assert off_P.max() < 1e-4
 
 
 @cache
