@@ -36,6 +36,10 @@ from es_service.store.folder import holds_run
 from workers.asking import Rows, Told, gradients, results_of, rows_of
 from workers.host.policies import LanePolicies
 
+MOST_STEPS = 2**31 - 1
+"""Most environment steps of an episode."""
+LEFT = "the block of ask_tell was left; make the same call again to go on"
+
 
 class _Closed(BaseException):
     """The caller has left the block; raised in the thread of the run."""
@@ -133,7 +137,7 @@ class AskTell:
             fitness: [N], maximised: the return of each episode. NaN: the episode is invalid.
             descriptor: [N, B]; None: the first B parameters of each row.
             valid: [N] of bools, false for episodes that failed.
-            steps: [N], environment steps of each; None: 1 each.
+            steps: [N], environment steps of each, from 1 to 2**31 - 1; None: 1 each.
             moments: (count, mean [O], sum of squared deviations [O]) of all observations in the rows that train, for
                 the statistics with which observations are normalised; None: they stay.
 
@@ -150,15 +154,16 @@ class AskTell:
         if descriptor is None:
             descriptor = asked.parameters[:, : self._dimensions]
         descriptor_N_B = _array("descriptor", descriptor, (count, self._dimensions)).astype(np.float32)
-        steps_N = np.ones(count, np.int32) if steps is None else _array("steps", steps, (count,)).astype(np.int32)
-        if (steps_N < 1).any():
-            raise ConfigError(f"steps has {steps_N.min()}; must be at least 1", field="steps", allowed="at least 1")
+        steps_N = np.ones(count, np.int64) if steps is None else _array("steps", steps, (count,)).astype(np.int64)
+        if (wrong := steps_N[(steps_N < 1) | (steps_N > MOST_STEPS)]).size:
+            allowed = f"from 1 to {MOST_STEPS:,}"
+            raise ConfigError(f"steps has {wrong[0]}; must be {allowed}", field="steps", allowed=allowed)
         observed = Moments(0.0, np.zeros(size), np.zeros(size))
         if moments is not None:
             mean_O, m2_O = (_array("moments", moment, (size,)).astype(np.float64) for moment in moments[1:])
             observed = Moments(float(moments[0]), mean_O, m2_O)
         self._asked = None
-        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N, observed))
+        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed))
         self._receive()
 
     def _receive(self) -> None:
@@ -171,7 +176,7 @@ class AskTell:
             case Outcome() as outcome:
                 self.outcome = outcome
             case _Closed():
-                self._error = EvaluationError("the block of ask_tell was left; make the same call again to go on")
+                self._error = EvaluationError(LEFT)
                 raise self._error
             case BaseException() as error:
                 self._error = error
@@ -263,6 +268,8 @@ def ask_tell(
         search._asked = None
         search._to_run.put(None)
         thread.join()
+        if search.outcome is None and search._error is None:  # what the run asked last may still be in the queue
+            search._error = EvaluationError(LEFT)
 
 
 def _array(name: str, given: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

@@ -38,7 +38,7 @@ class WorkerActor:
             cores: number of cores that it may use at a time.
         """
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
-        self._environment = ""
+        self._task_code: tuple[str, ...] = ()
         self._run_chunks: Compilable | None = None
         self._parents: Parents | None = None
         self._turn = Lock()
@@ -61,7 +61,7 @@ class WorkerActor:
                 than the run's.
         """
         spec = pickle.loads(self._spec)
-        if problem := why_refused(spec.sources, spec.environment, spec.platform):
+        if problem := why_refused(spec.sources, spec.task_code, spec.platform):
             raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
@@ -72,9 +72,9 @@ class WorkerActor:
         from workers.parents import Parents
         from workers.rollouts import BACKENDS
 
-        self._environment = spec.environment
+        self._task_code = spec.task_code
         self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
-        with sendable(self._environment):
+        with sendable(*self._task_code):
             self._run_chunks = make_worker_with_cores(spec, self._cores)
         return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
@@ -84,7 +84,7 @@ class WorkerActor:
         The engine calls this before the first call of `run` for each kind of chunk.
         """
         assert self._run_chunks is not None, "compile was called before build"
-        with self._turn, sendable(self._environment):
+        with self._turn, sendable(*self._task_code):
             return self._run_chunks.seconds_to_compile(self._unpacked(chunks, parts))
 
     def run(self, chunks: bytes, *parts: bytes) -> bytes:
@@ -96,7 +96,7 @@ class WorkerActor:
             parts: other subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
         """
         assert self._run_chunks is not None, "run was called before build"
-        with sendable(self._environment):
+        with sendable(*self._task_code):
             try:
                 with self._turn:
                     work = self._unpacked(chunks, parts)

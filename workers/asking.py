@@ -107,11 +107,11 @@ def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[Chunk
 
 
 def _with_moments(results: list[ChunkResult], moments: Moments) -> list[ChunkResult]:
-    """The results, of which the first one with moments has all of them."""
+    """The results, of which the first one with moments has all of them, and the others have none."""
     for place, result in enumerate(results):
         if isinstance(result, EpisodesResult) and result.moments is not None:
             results[place] = replace(result, moments=moments)
-            break
+            moments = Moments(0.0, np.zeros_like(moments.mean_O), np.zeros_like(moments.m2_O))
     return results
 
 

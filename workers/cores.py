@@ -33,7 +33,7 @@ class _Child(NamedTuple):
     """What a child process has."""
 
     worker: Compilable
-    environment: str
+    task_code: tuple[str, ...]
     """The name of the task."""
     barrier: Any
     """Barrier of all children of the worker."""
@@ -95,7 +95,7 @@ def _begin_child(spec: WorkerSpec, parent: int, barrier: Any) -> None:
     """Prepare a child process, which ends with its parent."""
     global _child
     end_with(parent)
-    _child = _Child(make_worker(spec), spec.environment, barrier)
+    _child = _Child(make_worker(spec), spec.task_code, barrier)
 
 
 def _meet() -> None:
@@ -107,7 +107,7 @@ def _meet() -> None:
 def _compile_in_child(work: Sequence[Work]) -> None:
     assert _child is not None, "the pool initialises each child"
     try:
-        with sendable(_child.environment):
+        with sendable(*_child.task_code):
             _child.worker.compile(work)
     finally:
         _meet()
@@ -115,5 +115,5 @@ def _compile_in_child(work: Sequence[Work]) -> None:
 
 def _run_child(work: Sequence[Work]) -> list[ChunkResult]:
     assert _child is not None, "the pool initialises each child"
-    with sendable(_child.environment):
+    with sendable(*_child.task_code):
         return _child.worker(work)

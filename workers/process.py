@@ -72,7 +72,7 @@ def _descriptor(control: socket.socket) -> int | None:
 
 def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
     """Function that runs chunks, or the reason why there is none: other code, or an error."""
-    if problem := why_refused(spec.sources, spec.environment, spec.platform):
+    if problem := why_refused(spec.sources, spec.task_code, spec.platform):
         return RaisedError(problem, "")
     os.environ.update(xla_cache_settings())
     try:
@@ -80,7 +80,7 @@ def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
 
         return make_worker(spec)
     except BaseException as error:  # also sys.exit in an environment
-        return raised(error, spec.environment)
+        return raised(error, *spec.task_code)
 
 
 def _work(descriptor: int, run_chunks: Compilable | RaisedError, spec: WorkerSpec) -> None:
@@ -120,7 +120,7 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
                 except LackingError:
                     answer = ("lacks", item, attempt)
                 except BaseException as error:  # also sys.exit in an environment
-                    answer = ("failure", item, attempt, raised(error, spec.environment))
+                    answer = ("failure", item, attempt, raised(error, *spec.task_code))
                 parent.sendall(framed(answer))
                 forget_old_subjects(subjects)
 

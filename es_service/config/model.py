@@ -33,7 +33,7 @@ from es_service.config.yaml_text import dump_yaml
 from es_service.errors import ConfigError
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.policy_spec import Activation, Output
-from es_service.protocol.sources import worker_sources
+from es_service.protocol.sources import task_code, worker_sources
 
 
 class TaskConfig(Section):
@@ -66,6 +66,11 @@ class TaskConfig(Section):
     options: Options = Field(
         default_factory=dict, description="Settings of the task, such as `start`, which the task declares."
     )
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """`sources.task_code` of the task."""
+        return task_code(self.environment, self.descriptor)
 
 
 class PolicyConfig(Section):
@@ -268,6 +273,6 @@ def worker_spec(
         noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
         outputs=tuple(sorted({*outputs, *search.outputs()})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
-        sources=worker_sources(settings.environment),
+        sources=worker_sources(*settings.code),
         platform=compute.platform,
     )

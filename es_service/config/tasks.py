@@ -24,7 +24,7 @@ from es_service.protocol.options import Option, OptionValue, choice
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.rollouts import Rollouts
-from es_service.protocol.sources import user_sources
+from es_service.protocol.sources import task_code, user_sources
 from workers import environments
 from workers.rollouts import BACKENDS
 
@@ -47,10 +47,7 @@ class Tasks(TaskTable):
         if ":" not in name:
             return environments.SHIPPED[name]
         settings = environments.settings_of_description(name, options, descriptor)
-        if isinstance(descriptor, str) and ":" in descriptor:
-            code = {**user_sources(name), **user_sources(descriptor)}
-        else:
-            code = user_sources(name)
+        code = user_sources(*task_code(name, descriptor))
         return _described(name, json.dumps(settings, sort_keys=True), tuple(code.items()))
 
     def __iter__(self) -> Iterator[str]:

@@ -71,8 +71,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             TaskError: there is no such task or option, or the task cannot be computed.
             ValueError: another argument is wrong.
         """
-        for name, value in (("num_envs", num_envs), ("threads", threads)):
-            if value < 1:
+        for name, value in (("num_envs", num_envs), ("threads", threads), ("max_episode_steps", max_episode_steps)):
+            if value is not None and value < 1:
                 raise ValueError(f"{name} = {value!r}; must be at least 1")
         require_mode(render_mode)
         self.render_mode, self._copies = render_mode, copy
@@ -85,7 +85,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._lanes = Lanes(task, task_options or {}, num_envs, threads)
         self.num_envs = num_envs
         self.task = self._lanes.task
-        self.max_episode_steps = max_episode_steps or self.task.episode_steps
+        self.max_episode_steps = self.task.episode_steps if max_episode_steps is None else max_episode_steps
         self.single_observation_space, self.single_action_space = observation_space(self.task), action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -19,6 +19,7 @@ from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import Recipes
+from es_service.protocol.sources import task_code
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
@@ -137,6 +138,11 @@ class WorkerSpec:
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
     platform: str = "any"
     """Architecture that a worker must have, as `system.architecture` names it; any if it makes no difference."""
+
+    @property
+    def task_code(self) -> tuple[str, ...]:
+        """`sources.task_code` of its task."""
+        return task_code(self.environment, self.descriptor)
 
 
 class WorkerPlace(NamedTuple):

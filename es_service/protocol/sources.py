@@ -15,7 +15,7 @@ import importlib.util
 import os
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -38,16 +38,26 @@ SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
 
-def worker_sources(environment: str) -> dict[str, str]:
+def task_code(environment: str, descriptor: object) -> tuple[str, ...]:
+    """What a task's config says that may name code of a user: the task, and a descriptor that is `module:function`.
+
+    Args:
+        environment: the value of `task.environment`.
+        descriptor: the value of `task.descriptor`.
+    """
+    return (environment, descriptor) if isinstance(descriptor, str) and ":" in descriptor else (environment,)
+
+
+def worker_sources(*names: str) -> dict[str, str]:
     """Sources with which a worker computes.
 
     Those of this project are read once per process, because a process goes on with what it has imported. Those of the
     task are read anew, because new workers import them as they are now.
 
     Args:
-        environment: the value of `task.environment`.
+        names: `task_code` of the task.
     """
-    return _package_sources(*WORKERS) | user_sources(environment)
+    return _package_sources(*WORKERS) | user_sources(*names)
 
 
 def driver_sources(algorithm: str) -> dict[str, str]:
@@ -60,11 +70,15 @@ def driver_sources(algorithm: str) -> dict[str, str]:
     return _package_sources(*DRIVER) | user_sources(algorithm)
 
 
-def user_sources(path: str) -> dict[str, str]:
-    """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
-    own = user_path(path)
-    sources = {module.source: module.sha256 for module in modules_of(own).user.values()} if own else {}
-    return sources | _version(LIBRARY) if path.startswith(f"{LIBRARY}:") else sources
+def user_sources(*names: str) -> dict[str, str]:
+    """Sources of what these names of tasks, descriptors or algorithms name, as they are now; none of ours."""
+    sources: dict[str, str] = {}
+    for name in names:
+        if own := user_path(name):
+            sources |= {module.source: module.sha256 for module in modules_of(own).user.values()}
+        if name.startswith(f"{LIBRARY}:"):
+            sources |= _version(LIBRARY)
+    return sources
 
 
 def _version(package: str) -> dict[str, str]:
@@ -90,12 +104,12 @@ class OtherCodeError(Exception):
     """This host must not work for a driver; the message names the host and the reason."""
 
 
-def why_refused(expected: Sources, environment: str, platform: str = "any") -> str:
+def why_refused(expected: Sources, names: Sequence[str], platform: str = "any") -> str:
     """Why this process must not work for a driver, naming the host and what is wrong; empty if it may.
 
     Args:
         expected: `worker_sources` of the driver; empty if the driver does not ask for it.
-        environment: the value of `task.environment`.
+        names: `task_code` of the task.
         platform: the value of `compute.platform`.
     """
     if platform not in ("any", architecture()):
@@ -103,7 +117,7 @@ def why_refused(expected: Sources, environment: str, platform: str = "any") -> s
             f"{socket.gethostname()} has a processor of the architecture {architecture()}, but compute.platform keeps "
             f"this run to {platform}. Set it to any if its digest may be marked mixed"
         )
-    if not expected or not (other := other_files(expected, worker_sources(environment))):
+    if not expected or not (other := other_files(expected, worker_sources(*names))):
         return ""
     return (
         f"{socket.gethostname()} has other code than the driver had when it started, so it must not compute for this "
@@ -113,7 +127,7 @@ def why_refused(expected: Sources, environment: str, platform: str = "any") -> s
 
 
 def user_path(name: str) -> str:
-    """The user's code that a task or an algorithm names, as `package.module:name`; empty if it names none.
+    """The code of a user that a name in a config means, as `package.module:name`; empty if it means none.
 
     `brax:NAME` is none. What is simulated by Python has the kind of the task before the path, as in
     `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module that
@@ -129,7 +143,7 @@ def user_path(name: str) -> str:
 
 
 def is_user_code(name: str) -> bool:
-    """Whether a task or an algorithm is the user's."""
+    """Whether a task, a descriptor or an algorithm is the user's."""
     return bool(user_path(name))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from es_service.errors import ServiceError
 from es_service.protocol.recordings import Recordings
-from es_service.protocol.sources import is_user_code
+from es_service.protocol.sources import is_user_code, task_code
 from es_service.report import floor
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -45,7 +45,8 @@ def replay_section(
         run.cell(place)
     if certified:
         run.policy("certified")
-    names = (run.present_config["task"]["environment"], run.present_config["search"]["algorithm"])
+    task, search = run.present_config["task"], run.present_config["search"]
+    names = (*task_code(task["environment"], task.get("descriptor")), search["algorithm"])
     if not trusted and (code := [name for name in names if is_user_code(name)]):
         return _no_replay(
             f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "

@@ -28,7 +28,7 @@ from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
-from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, stored
+from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, measure_of, stored
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
@@ -266,4 +266,4 @@ def _measure(config: RunConfig, by: Measure | None) -> Measure:
             value=by,
             allowed=", ".join(allowed),
         )
-    return by or ("return" if config.task.fitness == "sum" else "last_reward")
+    return by or measure_of(config.task.fitness)

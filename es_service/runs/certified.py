@@ -112,12 +112,18 @@ def newest_certified(folder: Path) -> Certified | None:
     return next((_from_row(row) for row in read_certifications(folder, newest=True) if row.rank == 0), None)
 
 
-def target_reached(folder: Path, target: float | None) -> str:
-    """Why a run is over whose `budget.target_certified` is this, in words; empty if no certified policy reaches it."""
+def measure_of(fitness: str) -> Measure:
+    """What `task.fitness` says of an episode."""
+    return "return" if fitness == "sum" else "last_reward"
+
+
+def target_reached(folder: Path, target: float | None, fitness: str) -> str:
+    """Why a run is over whose `budget.target_certified` and `task.fitness` these are, in words; empty if no certified
+    policy reaches the target, by whatever it was selected."""
     if target is None:
         return ""
     for policy in certified_policies(folder):
-        mean = policy.row()[f"{policy.selected_by}_mean"]
+        mean = policy.row()[f"{measure_of(fitness)}_mean"]
         if mean is not None and mean >= target:
             return (
                 f"the target {target:g} is reached: a policy of generation {policy.generation} has {mean:.6g} in "

@@ -23,13 +23,13 @@ from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
 from es_service.protocol.evaluator import Evaluator
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments, WorkerSpec
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.snapshot import Policy, make_policy
-from es_service.runs.view import Run, is_light, is_no_elite
+from es_service.runs.snapshot import Policy, Snapshot, make_policy
+from es_service.runs.view import Run, is_no_elite
 from es_service.runs.worker_count import on_this_machine, require_cores
 from es_service.search.observation_statistics import merge_moments, moments_of
 
@@ -56,7 +56,11 @@ class Candidate:
     stored_fitness: float
     """Mean fitness that the run stored for it."""
     cell: int | None = None
-    """Number of its cell; None if it is not an elite."""
+    """Number of its cell; None if it is not an elite. The next two are of an elite too."""
+    centre: int | None = None
+    """Number of the evaluated centre or policy."""
+    trace_T_B: FloatArray | None = None
+    """Descriptor of its first evaluation episode up to each of T points in time."""
 
 
 @dataclass(frozen=True)
@@ -135,21 +139,22 @@ def candidates(
         chosen.append(Candidate("centre", snapshot.policy("centre"), snapshot.generation, fitness))
     if not cells and not every and not top:
         return chosen
-    wanted = None
-    if not every:
-        snapshot = run.at(generation, is_light)
-        fittest = np.argsort(-snapshot.behaviour_map.fitness_N, kind="stable")[:top]
-        best_cells = snapshot.behaviour_map.cell_N[fittest].tolist()
-        wanted = list(dict.fromkeys([*map(snapshot.cell, cells), *best_cells]))
-    map_, elites = run.elites(wanted, generation)
+
+    def wanted(snapshot: Snapshot) -> list[int]:
+        map_ = snapshot.behaviour_map
+        fittest = np.argsort(-map_.fitness_N, kind="stable")[:top]
+        return list(dict.fromkeys([*map(snapshot.cell, cells), *map_.cell_N[fittest].tolist()]))
+
+    map_, elites = run.elites(None if every else wanted, generation)
     if not elites and (cells or every):
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
-    for cell in map_.cell_N.tolist() if wanted is None else wanted:
-        row, elite = map_.row_of(cell), elites[cell]
+    for cell, elite in elites.items():
+        row = map_.row_of(cell)
         assert row is not None
         policy = make_policy(run.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
         name = ",".join(map(str, map_.geometry.index_of(cell)))
-        chosen.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
+        evaluated = int(map_.generation_N[row]), float(map_.fitness_N[row])
+        chosen.append(Candidate(name, policy, *evaluated, cell, int(map_.centre_N[row]), elite.trace_T_B))
     return chosen
 
 

@@ -19,7 +19,7 @@ MIXED = "Its digest is now marked `mixed`."
 
 def code_of(config: RunConfig) -> Sources:
     """Hashes of all code that computes a run, that of the driver and that of its workers."""
-    return worker_sources(config.task.environment) | driver_sources(config.search.algorithm)
+    return worker_sources(*config.task.code) | driver_sources(config.search.algorithm)
 
 
 def platform_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

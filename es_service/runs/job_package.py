@@ -86,7 +86,7 @@ def _package(command: Sequence[str], out: str, text: str, configs: Sequence[RunC
         )
     files: dict[str, Path] = {}
     expected: set[str] = set()
-    named = {path for config in configs for path in (config.task.environment, config.search.algorithm)}
+    named = {path for config in configs for path in (*config.task.code, config.search.algorithm)}
     for path in filter(None, map(user_path, named)):
         modules = modules_of(path)
         if modules.is_installed:

@@ -133,12 +133,10 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
     """What is stored of a policy's first evaluation episode; None if its address is not."""
     if not np.isfinite(candidate.stored_fitness):
         return None  # a fork that changed the meaning of fitness has kept the policy, but not its evaluation
-    if candidate.cell is None:
+    centre = candidate.centre
+    if centre is None:
         [history] = reader.read_history(run.folder, candidate.generation, 1)
-        centre, trace_T_B = history["centre"], None  # the best was the fittest of its generation
-    else:
-        map_, elites = run.elites([candidate.cell])
-        centre, trace_T_B = map_.centre_N[map_.row_of(candidate.cell)], elites[candidate.cell].trace_T_B
+        centre = history["centre"]  # the best was the fittest of its generation
     [rows] = reader.read_evaluations(run.folder, candidate.generation, 1)
     row = next((row for row in rows if row["centre"] == centre), {})
     seed, episode, ask, policy = (row.get(f"reset_{field.name}", np.nan) for field in fields(Resets))
@@ -152,7 +150,7 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
         rollouts = parent.get("rollouts", ["unknown"])  # this run is a fork, and its parent has computed the episode
         changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
     request = RecordRequest(_centre(candidate), **vars(resets))
-    return StoredEpisode(request, row["fitness_first"], trace_T_B, tuple(changes))
+    return StoredEpisode(request, row["fitness_first"], candidate.trace_T_B, tuple(changes))
 
 
 def _answer(question: tuple) -> Recordings:

@@ -142,7 +142,7 @@ def _session(
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
-        if reason := target_reached(folder, config.budget.target_certified):
+        if reason := target_reached(folder, config.budget.target_certified, config.task.fitness):
             return config, Outcome(open_run(folder), reason)
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, folder, config)

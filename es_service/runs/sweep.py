@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -19,12 +19,14 @@ from typing import IO, Literal
 
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
+from es_service.config.model import RunConfig
 from es_service.errors import Interrupted, RunLockedError, StoreError
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, spent
 from es_service.loop.history import Row
 from es_service.protocol.parent import bound
 from es_service.protocol.process_environment import same_imports
+from es_service.runs.certified import target_reached
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.sweep_cores import shared
@@ -120,6 +122,7 @@ def run_planned(
     """
     with _locked(out) as inside, stop_on_signals() as should_stop:
         runs = {run.name: _at_first(run) for run in planned}
+        configs = {run.name: run.config for run in planned}
         left = [run for run in planned if runs[run.name].state == "waiting"]
         shares = shared([run.config for run in left], parallel)  # a few that are left have more cores each
         waiting = deque(
@@ -135,7 +138,7 @@ def run_planned(
                 if (number := should_stop()) is not None:
                     raise Interrupted(number)
                 for name in [name for name, child in running.items() if child.process.poll() is not None]:
-                    runs[name] = _ended(runs[name], running.pop(name))
+                    runs[name] = _ended(runs[name], running.pop(name), configs[name])
                 while waiting and len(running) < shares.at_once:
                     _start(waiting.popleft(), inside, runs, running)
                 if time.monotonic() - read_s > ROWS_S:
@@ -146,7 +149,7 @@ def run_planned(
                 if running:
                     time.sleep(POLL_S)
         except BaseException:
-            _stop(runs, running)
+            _stop(runs, running, configs)
             with suppress(Exception):
                 on_progress(list(runs.values()))
             raise
@@ -179,41 +182,43 @@ def _start(command: _Command, inside: Path, runs: dict[str, SweptRun], running: 
     """Start the process of a run; the run has failed if that is impossible."""
     name, words = command
     try:
-        log = open(inside / f"{name}.log", "ab+")  # noqa: SIM115
-        begin = log.seek(0, os.SEEK_END)
-        process = subprocess.Popen(
-            words,
-            env=os.environ | same_imports(),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
-        )
+        with ExitStack() as opened:
+            log = opened.enter_context(open(inside / f"{name}.log", "ab+"))
+            begin = log.seek(0, os.SEEK_END)
+            process = subprocess.Popen(
+                words,
+                env=os.environ | same_imports(),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
+            )
+            opened.pop_all()
     except OSError as error:
         runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")
         return
     running[name], runs[name] = _Child(process, log, begin), replace(runs[name], state="running")
 
 
-def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child]) -> None:
+def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child], configs: Mapping[str, RunConfig]) -> None:
     """Ask all processes to end as Ctrl-C would, and wait for them. A second signal to this process ends it at once, and
     with it all that are bound to it."""
     for child in running.values():
         child.process.terminate()
     for name, child in running.items():
         child.process.wait()
-        ended = _ended(runs[name], child)
+        ended = _ended(runs[name], child, configs[name])
         runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
 
 
-def _ended(run: SweptRun, child: _Child) -> SweptRun:
+def _ended(run: SweptRun, child: _Child, config: RunConfig) -> SweptRun:
     """A run after its process has ended."""
     code, row = child.process.returncode, _newest(run.folder)
     with child.log as log:
         log.seek(max(child.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
         lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
     if code == 0:
-        return replace(run, state="finished", row=row, reason=_reason(run.limits, row))
+        return replace(run, state="finished", row=row, reason=_reason(run.folder, config, row))
     how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     last = f"{how}; its last line is: {lines[-1]}" if lines else how
@@ -222,16 +227,22 @@ def _ended(run: SweptRun, child: _Child) -> SweptRun:
 
 
 def _at_first(planned: PlannedRun) -> SweptRun:
-    """A run that the sweep has not started: finished, if its budget was spent before."""
-    limits = limits_of(planned.config.budget)
+    """A run that the sweep has not started: finished, if its budget was spent or its target reached before."""
     row = _newest(planned.folder)
-    reason = _reason(limits, row)
-    return SweptRun(planned.name, planned.folder, limits, "finished" if reason else "waiting", row, reason)
+    reason = _reason(planned.folder, planned.config, row)
+    return SweptRun(
+        planned.name, planned.folder, limits_of(planned.config.budget), "finished" if reason else "waiting", row, reason
+    )
 
 
-def _reason(limits: Mapping[str, float], row: Row | None) -> str:
-    """Why a run is over; empty if it is not."""
-    return next(iter(spent(limits, row).values()), "") if row else ""
+def _reason(folder: Path, config: RunConfig, row: Row | None) -> str:
+    """Why a run is over; empty if it is not, or if it cannot be read, which its own process tells."""
+    if row is None:
+        return ""
+    with suppress(StoreError):
+        if reached := target_reached(folder, config.budget.target_certified, config.task.fitness):
+            return reached
+    return next(iter(spent(limits_of(config.budget), row).values()), "")
 
 
 def _newest(folder: Path) -> Row | None:

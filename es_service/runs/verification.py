@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from es_service.config.model import BudgetConfig, worker_spec
@@ -73,9 +73,8 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
     config = changed_config(stored, on_this_machine(stored, workers))
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
     plan = _plan(run, generations)
-    budget = BudgetConfig.model_validate({"generations": (run.generation or 0) + 1})  # not spent before the plan is
     search = driver.Search(
-        config=config.model_copy(update={"budget": budget}),
+        config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: initial_centres(config, reader.read_start(run.folder)),
         task=task,
@@ -88,7 +87,9 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
         ) as engine,
     ):
         for begin, last in plan:
-            reached, differences = _recompute(run, search, engine, begin, last)
+            budget = BudgetConfig.model_validate({"generations": max(1, last)})  # or the next rollouts would begin
+            part = replace(search, config=config.model_copy(update={"budget": budget}))
+            reached, differences = _recompute(run, part, engine, begin, last)
             then = next((platform for first, platform in reversed(platforms) if first <= reached), {})
             now = {**platform_info(), CODE: code}
             yield Recomputed(0 if begin is None else begin + 1, reached, differences, tuple(changes_since(then, now)))

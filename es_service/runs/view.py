@@ -14,7 +14,7 @@ import numpy as np
 from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
-from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, elite_part
+from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, Parts, elite_part
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
 from es_service.runs.certified import certified_policies, newest_certified
@@ -147,24 +147,31 @@ class Run:
 
     def elite(self, place: int | Sequence[int]) -> Elite:
         """The elite of a cell: parameters, observation statistics and trace. Raises as `cell`."""
-        cell = self.cell(place)
-        return self.elites([cell])[1][cell]
+        [elite] = self.elites(lambda snapshot: [snapshot.cell(place)])[1].values()
+        return elite
 
     def elites(
-        self, cells: Collection[int] | None = None, generation: int | None = None
+        self, choose: Callable[[Snapshot], Collection[int]] | None = None, generation: int | None = None
     ) -> tuple[BehaviourMap, dict[int, Elite]]:
-        """The map, and its elites by the numbers of their cells, read from one generation.
+        """The map, and its elites by the numbers of their cells, read from one generation, also while a driver writes.
 
         Args:
-            cells: numbers of the elites' cells; None: all, which takes as much memory as all of their policies.
+            choose: called with the state without the elites, returns the numbers of filled cells, in the order in which
+                their elites are wanted; None: all, which takes as much memory as all of their policies.
             generation: one whose state is kept; None: the newest.
+
+        Raises what `choose` raises.
         """
-        names = None if cells is None else {elite_part(cell) for cell in cells}
+        cells: Collection[int] = ()
 
-        def wanted(part: str) -> bool:
-            return is_light(part) or (part.startswith(ELITE_PREFIX) if names is None else part in names)
+        def chosen(at: int, parts: Parts) -> list[str]:
+            nonlocal cells
+            snapshot = Snapshot(self.folder, self.meta, at, parts)
+            cells = snapshot.behaviour_map.cell_N.tolist() if choose is None else choose(snapshot)
+            return [elite_part(cell) for cell in cells]
 
-        return self.at(generation, wanted).elites(cells)
+        found = reader.read_parts(self.folder, generation, is_light, chosen)
+        return Snapshot(self.folder, self.meta, *found).elites(cells)
 
     @property
     def certified(self) -> pd.DataFrame:

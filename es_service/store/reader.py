@@ -7,7 +7,7 @@ functions that take a folder raise StoreError as `reading` does, and if what the
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,10 +126,16 @@ def _refuse_lost_end(connection: sqlite3.Connection, newest: int) -> None:
 
 
 def read_parts(
-    folder: Path, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
+    folder: Path,
+    generation: int | None = None,
+    wanted: Callable[[str], bool] = lambda part: True,
+    further: Callable[[int, dict[str, dict[str, NDArray[Any]]]], Collection[str]] = lambda generation, parts: (),
 ) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`.
-    Raises StoreError also if the state of this generation is not kept."""
+    """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`, and
+    of those that `further` names when it sees these, all as of one moment.
+
+    Raises StoreError also if the state of this generation is not kept, and KeyError if it has no such further part.
+    """
     with reading(folder) as (connection, _):
         newest = newest_generation(connection)
         if newest is None:
@@ -151,8 +157,10 @@ def read_parts(
                 suggestion=max(whole, default=None),
                 run=folder,
             )
-        rows = {part: row for part, row in rows_in_force(kept, asked).items() if wanted(part)}
-        return asked, {part: sound_part(connection, part, *row) for part, row in rows.items()}
+        rows = rows_in_force(kept, asked)
+        parts = {part: sound_part(connection, part, *row) for part, row in rows.items() if wanted(part)}
+        names = further(asked, parts)
+        return asked, parts | {part: sound_part(connection, part, *rows[part]) for part in names if part not in parts}
 
 
 def read_kept(folder: Path) -> tuple[KeptRows, list[int]]:

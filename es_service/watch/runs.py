@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -68,7 +69,8 @@ class Runs:
         """The runs that there are now, in the order of their names."""
         runs = {run.key: run for root in self._roots for run in _below(root)}
         self._known |= runs
-        self._summaries = {key: seen_summary for key, seen_summary in self._summaries.items() if key in runs}
+        before = self._summaries  # to which another thread may add meanwhile
+        self._summaries = {key: before[key] for key in runs if key in before}
         return list(runs.values())
 
     def get(self, key: str) -> Found | None:
@@ -95,11 +97,12 @@ class Runs:
 
 
 class Reading:
-    """A run that is read again and again; each time, only what is new."""
+    """A run that is read again and again; each time, only what is new. Threads that do so at once wait for another."""
 
     def __init__(self, found: Found) -> None:
         self._found, self._followed = found, followed(found.folder)
         self._seen: Any = None
+        self._lock = threading.Lock()
         self.data: RunData | None = None
         """The run as it was read last; None before that."""
         self.whole = False
@@ -107,6 +110,10 @@ class Reading:
 
     def update(self) -> bool:
         """Read what is new; return whether there was something. Raises StoreError if the run cannot be read."""
+        with self._lock:
+            return self._update()
+
+    def _update(self) -> bool:
         seen = seen_of(self._found.folder), time.monotonic() // AGAIN_S
         if self.whole and seen == self._seen:
             return False

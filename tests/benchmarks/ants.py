@@ -108,7 +108,7 @@ def best_way(run: Run) -> np.ndarray | None:
     best = history.loc[history.centre_fitness_mean.idxmax()]
     if "cell" not in history or pd.isna(best.cell):
         return None
-    _, elites = run.elites([int(best.cell)])
+    _, elites = run.elites(lambda snapshot: [int(best.cell)])
     return np.asarray(elites[int(best.cell)].trace_T_B)
 
 

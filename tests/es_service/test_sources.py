@@ -152,13 +152,13 @@ OTHER = {**WORKERS, "workers/policies/policy.py": "0" * 32, "workers/gone.py": "
 
 def test_a_worker_with_other_code_names_host_and_files(monkeypatch):
     monkeypatch.setattr("socket.gethostname", lambda: "node-7")
-    assert why_refused(WORKERS, "point_maze") == why_refused({}, "point_maze", architecture()) == ""
+    assert why_refused(WORKERS, ["point_maze"]) == why_refused({}, ["point_maze"], architecture()) == ""
     monkeypatch.setattr("platform.machine", lambda: "arm64")
-    assert why_refused({}, "point_maze", "aarch64") == ""
+    assert why_refused({}, ["point_maze"], "aarch64") == ""
     assert "of the architecture aarch64, but compute.platform keeps this run to x86_64" in why_refused(
-        {}, "point_maze", "x86_64"
+        {}, ["point_maze"], "x86_64"
     )
-    problem = why_refused(OTHER, "point_maze")
+    problem = why_refused(OTHER, ["point_maze"])
     assert problem.startswith("node-7 has other code")
     assert "workers/gone.py, workers/policies/policy.py." in problem
     with pytest.raises(OtherCodeError, match=r"node-7 has other code.*workers/policies/policy\.py"):

@@ -12,12 +12,13 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.options import OptionValue
 from es_service.protocol.parent import bound, start_child
+from es_service.protocol.process_environment import same_imports
 from es_service.protocol.raised import raised
 from es_service.protocol.wire import framed, receive
 from workers.environments import make_function_task
@@ -66,16 +67,20 @@ class Caller:
         self._process = self._socket = None
 
     def _start(self) -> None:
-        self._socket, theirs = socket.socketpair()
-        with theirs:
+        ours, theirs = socket.socketpair()
+        with theirs, ExitStack() as unless_started:
+            unless_started.enter_context(ours)
             self._process = start_child(
                 lambda: subprocess.Popen(
                     bound("workers.host.caller", str(theirs.fileno())),
+                    env=os.environ | same_imports(),
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     start_new_session=True,
                 )
             )
+            unless_started.pop_all()
+        self._socket = ours
         self._send(self._given)
         if (problem := self._answer(START_S, f"its process did not start within {START_S:g} s")) is not None:
             self.close()
