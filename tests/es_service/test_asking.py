@@ -11,6 +11,7 @@ from es_service.asking import Asked
 from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, EvaluationError
+from es_service.loop.parts import OBSERVATIONS, moments_from_arrays
 from es_service.report.settings import changed_settings
 from es_service.runs.polishing import polish_config
 from es_service.store.digest import digest_parts
@@ -107,9 +108,17 @@ def test_left_anywhere_it_asks_the_same_again_and_ends_with_the_same_bits(tmp_pa
     assert digest_parts(folder) == digest_parts(whole.folder)
 
 
+OBSERVING = {
+    "task": {
+        "environment": "caller",
+        "options": {"observation_size": 2, "action_size": 1, "descriptor_size": 1},
+    },
+    "map": {"bounds": [[-1, 1]], "cells": [4]},
+}
+
+
 def test_observations_that_are_told_normalise_later_ones(tmp_path):
-    sizes = {"observation_size": 2, "action_size": 1, "descriptor_size": 1}
-    config = config_of("es", {"environment": "caller", "options": sizes}, map={"bounds": [[-1, 1]], "cells": [4]})
+    config = config_of("es", **OBSERVING)
     with ask_tell(config, tmp_path / "run") as search:
         while (asked := search.ask()) is not None and asked.generation < 3:
             count = len(asked)
@@ -118,6 +127,23 @@ def test_observations_that_are_told_normalise_later_ones(tmp_path):
             np.testing.assert_allclose(asked.observation_std, [expected[1]] * count, rtol=1e-4)
             moments = (1e8, [3.0, -1.0], [4e8, 0.25e8]) if asked.trains.any() else None
             search.tell(np.arange(count), np.zeros((count, 1)), moments=moments)
+
+
+def test_of_several_populations_all_observations_are_told_once_or_not_at_all(tmp_path):
+    def told(folder, moments):
+        with ask_tell(config_of("memes", **OBSERVING), tmp_path / folder) as search:
+            while (asked := search.ask()) is not None and asked.generation < 3:
+                given = moments if asked.trains.any() else None
+                search.tell(
+                    np.arange(len(asked)), np.zeros((len(asked), 1)), steps=np.full(len(asked), 7), moments=given
+                )
+            return moments_from_arrays(search.run.parts(wanted=lambda part: part == OBSERVATIONS)[1][OBSERVATIONS])
+
+    assert told("none", None).count == 0
+    after = told("some", (1e8, [3.0, -1.0], [4e8, 0.25e8]))
+    assert after.count == 2e8
+    np.testing.assert_allclose(after.mean_O, [3.0, -1.0], rtol=1e-4)
+    np.testing.assert_allclose(np.sqrt(after.m2_O / after.count), [2.0, 0.5], rtol=1e-4)
 
 
 def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
@@ -137,6 +163,7 @@ def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
         ({"fitness": ["a", "b"]}, "fitness"),
         ({"fitness": np.zeros(2), "descriptor": np.zeros((2, 3))}, "descriptor"),
         ({"fitness": np.zeros(2), "steps": [0, 1]}, "steps"),
+        ({"fitness": np.zeros(2), "steps": [1, 2**31]}, "steps"),
         ({"fitness": np.zeros(2), "moments": (1.0, [0.0, 1.0], [0.0])}, "moments"),
     ],
 )
@@ -160,11 +187,13 @@ def test_what_is_no_task_of_the_caller_is_refused_and_so_is_telling_after_the_en
             search.tell(*told_of(asked))
         with pytest.raises(EvaluationError, match="the run has ended, so nothing is asked"):
             search.tell([0.0])
-    with ask_tell(config_of("es"), tmp_path / "left") as search:
-        search.ask()
-    for _ in range(2):
-        with pytest.raises(EvaluationError, match="the block of ask_tell was left"):
-            search.ask()
+    for asks in (0, 1):
+        with ask_tell(config_of("es"), tmp_path / "left") as search:
+            for _ in range(asks):
+                search.ask()
+        for _ in range(2):
+            with pytest.raises(EvaluationError, match="the block of ask_tell was left"):
+                search.ask()
 
 
 def test_readers_know_the_run_and_whoever_would_compute_episodes_says_whose_they_are(tmp_path):

@@ -145,6 +145,13 @@ def test_the_files_that_count_as_code_are_sent_and_have_the_same_hashes_there(ow
     assert json.loads(process.stdout) == [here, worker_sources("point_maze")]
 
 
+def test_the_module_of_a_descriptor_is_sent(own, submitted):
+    (own / "sent_numbers.py").write_text("def place(episode):\n    return [0.0]\n")
+    task = ("task.environment=python:tests.workers.host_tasks:CornerMaze", "task.descriptor=sent_numbers:place")
+    package, _ = submitted(*(word for key in task for word in ("--set", key)), "--set", "map.bounds=[[0,1]]")
+    assert "sent_numbers.py" in package.files
+
+
 def test_an_installed_package_is_not_sent_but_named(own, submitted, monkeypatch):
     place = own / "site-packages"
     (own / "sent_searches").rename(place.with_name("moved"))

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
+import numpy as np
 import pytest
 
 from es_service import api
@@ -97,3 +101,44 @@ def test_the_certified_policy_is_shown_in_its_certification_episode_of_median_fi
     assert "of certification 1, which is the one of median fitness" in page
     assert page.count("bit for bit") == 2
     assert 'class="problem' not in page
+
+
+def test_elites_are_of_the_generation_in_which_they_were_chosen_also_while_a_driver_writes(tmp_path):
+    begun, goes_on = Event(), Event()
+
+    def after(row):
+        if row["generation"] == 2:
+            begun.set()
+            goes_on.wait(60)
+
+    def choose(snapshot):
+        goes_on.set()
+        ended.result(60)
+        return snapshot.behaviour_map.cell_N.tolist()
+
+    with ThreadPoolExecutor(1) as driver:
+        config = api.load_config(CONFIG, ["budget.generations=12"])
+        ended = driver.submit(api.run, config, tmp_path / "run", on_generation=after)
+        begun.wait(60)
+        run = api.open_run(tmp_path / "run")
+        before_map, before = run.elites()
+        map_, elites = run.elites(choose)
+    assert run.generation == 12
+    np.testing.assert_array_equal(map_.centre_N, before_map.centre_N)
+    then, now, later = (
+        {cell: elite.centre_D.tolist() for cell, elite in some.items()} for some in (before, elites, run.elites()[1])
+    )
+    assert now == then
+    assert now != {cell: later[cell] for cell in now if cell in later}, "some have been replaced"
+
+
+def test_a_replay_executes_code_that_a_config_names_only_if_that_is_trusted(tmp_path):
+    config = {"task": {"environment": "gymnasium:Pendulum-v1", "episode_steps": 3, "descriptor": f"{__name__}:angle"}}
+    config |= {"search": {"algorithm": "es", "pairs": 2}, "map": {"bounds": [[-1, 1]], "cells": [4]}}
+    run = api.run(config | {"budget": {"generations": 1}, "compute": {"workers": 1}}, tmp_path / "run").run
+    assert f"A replay would execute {__name__}:angle" in page_of(run)
+
+
+def angle(episode):
+    """A descriptor of an episode of Pendulum-v1."""
+    return [float(np.clip(episode.observation_O[0], -1, 1))]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from es_service.api import load_config
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
@@ -22,10 +23,12 @@ from es_service.protocol.sources import (
     driver_sources,
     in_words,
     other_files,
+    task_code,
     why_refused,
     worker_sources,
 )
 from es_service.protocol.system import architecture
+from es_service.runs.identity import code_of
 from tests.helpers import SPEC, centre, random_parameters
 from workers.actor import WorkerActor
 
@@ -132,6 +135,19 @@ def test_a_user_s_modules_count_with_what_they_import_from_the_same_place(own):
     assert other_files(task, worker_sources("my_task:Maze")) == ["my_constants.py"]
     (own / "my_physics.py").unlink()
     assert other_files(task, worker_sources("my_task:Maze")) == ["my_constants.py", "my_physics.py"]
+
+
+def test_a_descriptor_that_is_a_user_s_function_is_code_of_the_task(own):
+    name = "gymnasium:Pendulum-v1"
+    assert task_code(name, None) == task_code(name, "angle") == task_code(name, (0, 1)) == (name,)
+    task, without_map = {"environment": name}, {"enabled": False}
+    config = load_config(
+        {"task": task, "search": {"algorithm": "es"}, "map": without_map, "budget": {"generations": 1}}
+    )
+    described = config.task.model_copy(update={"descriptor": "my_task:f"})
+    code = code_of(config.model_copy(update={"task": described}))
+    assert set(other_files(code_of(config), code)) == {"my_task.py", "my_physics.py", "my_constants.py"}
+    assert "my_task.py" in other_files(worker_sources(name), worker_sources(*described.code))
 
 
 @pytest.mark.parametrize("name", ["brax:ant", "no_such_module:Class", "sys:path", "rich.table:Table", "json:loads"])

@@ -7,7 +7,10 @@ import pytest
 
 from es_service import api
 from es_service.runs import run_status
+from es_service.runs.certification import certify_run
 from es_service.runs.certified import certified_policies
+from es_service.runs.sweep import INSIDE, run_planned
+from es_service.runs.sweep_plan import plan
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
@@ -69,3 +72,22 @@ def test_a_stop_of_the_caller_comes_first(whole, tmp_path):
     config = api.load_config(CONFIG, [f"budget.target_certified={target}"])
     outcome = api.run(config, tmp_path / "run", on_generation=lambda row: api.Stop("enough"))
     assert (outcome.reason, outcome.run.generation) == ("enough", 0)
+
+
+@pytest.mark.parametrize("by", ["success", "goal_distance"])
+def test_a_policy_that_was_selected_by_something_else_reaches_the_target_by_its_fitness(by, tmp_path):
+    config = api.load_config(CONFIG, ["budget.target_certified=-1", "budget.generations=1"])
+    run = api.run(config, tmp_path / "run").run
+    [policy] = certify_run(run.folder, by=by, episodes=2)
+    assert policy.row()["return_mean"] < -1, "while goal distances are above it"
+    assert run_status.state(run_status.read_status(run)).startswith("finished: the budget of 1 generations")
+
+
+def test_a_sweep_leaves_alone_what_has_reached_its_target(whole, tmp_path):
+    target = float(whole.history["best_fitness"].iloc[0]) - 0.5
+    [planned] = plan(CONFIG, tmp_path, seeds=[0], overrides=[f"budget.target_certified={target}"])
+    reason = api.run(planned.config, planned.folder).reason
+    assert reason.startswith("the target")
+    [left] = run_planned([planned], tmp_path)
+    assert (left.state, left.reason) == ("finished", reason)
+    assert not any((tmp_path / INSIDE).glob("*.yaml")), "no process was started"

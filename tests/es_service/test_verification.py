@@ -37,6 +37,8 @@ class Worker(DirectEvaluator):
 
     def __init__(self, spec):
         super().__init__(spec)
+        self.generations: set[int] = set()
+        """Generations of which it has computed something."""
         self.flip = None
         """(generation, kind of result, name of its array) in which the next result has a wrong bit."""
 
@@ -44,6 +46,7 @@ class Worker(DirectEvaluator):
         """Return at once."""
 
     def evaluate(self, work):
+        self.generations.update(chunk.generation for _, chunk in work)
         results = super().evaluate(work)
         for (_, chunk), result in zip(work, results, strict=True):
             if self.flip and self.flip[0] == chunk.generation and isinstance(result, self.flip[1]):
@@ -85,10 +88,13 @@ def test_a_sound_run_is_equal_however_much_of_it_is_computed(tmp_path):
     assert {(one.differences, one.changes) for one in some + most + whole} == {((), ())}
 
 
-def test_a_run_that_keeps_no_more_than_it_must_can_be_computed_from_its_start(tmp_path):
+def test_a_run_that_keeps_no_more_than_it_must_can_be_computed_from_its_start(tmp_path, worker):
     run = computed(tmp_path / "run", "store.keep_every=null")
     found = list(verify(run, 1000))
     assert spans(found) == [(0, 11), (12, 12)]
+    worker.generations.clear()
+    assert spans(verify(run, 3)) == [(0, 2), (12, 12)]
+    assert worker.generations == {0, 1, 2, 12}, "nothing beyond the last one that is compared"
     assert not any(one.differences for one in found)
 
 

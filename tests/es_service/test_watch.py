@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -164,6 +165,16 @@ def test_reading_what_is_new_equals_reading_all_also_after_a_fall_back(tmp_path,
     api.run(MAPPED | {"seed": 5}, folder)  # another run in the same folder
     compare()
     assert reading.data.meta.config["seed"] == 5
+
+
+def test_threads_that_read_a_run_at_once_read_each_generation_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 100)
+    folder = write_run(tmp_path / "runs/a", generations=2000)
+    reading = Reading(Runs([tmp_path / "runs"]).find()[0])
+    with ThreadPoolExecutor(4) as threads:
+        while not reading.whole:
+            list(threads.map(lambda _: reading.update(), range(4)))
+    same(reading.data, read_run(folder, paths=False, digest=False))
 
 
 def test_a_damaged_run_shows_what_is_left(tmp_path):

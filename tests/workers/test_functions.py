@@ -25,6 +25,7 @@ from tests.helpers import centre, spec, workers_in_this_process
 from tests.workers import functions
 from tests.workers.test_host import NO_JAX
 from workers.environments import TaskError, describe_environment
+from workers.host.caller import Caller
 from workers.worker import make_worker
 
 MODULE = "tests.workers.functions"
@@ -295,3 +296,24 @@ def test_a_function_that_contradicts_itself_is_refused(name, value, problem, mon
 def test_what_is_no_such_function_is_named(name):
     with pytest.raises(TaskError, match=r"is no function|has no attribute parameters|has no function nothing"):
         describe_environment(name)
+
+
+def test_a_call_in_a_process_of_its_own_imports_what_its_worker_can(tmp_path, monkeypatch):
+    """Ray adds the driver's folders to the path of an actor, not to its environment variables."""
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "far_away.py").write_text("def f(x):\n    return sum(x)\n\n\nf.parameters = ('a', 'b')\n")
+    monkeypatch.syspath_prepend(tmp_path / "far")
+    monkeypatch.chdir(tmp_path)
+    caller = Caller("function:far_away:f", {}, 20.0)
+    assert caller(np.float32([1.0, 2.0]), 0)[0] == 3.0
+    caller.close()
+
+
+def test_a_process_that_cannot_be_started_once_is_started_by_the_next_call(monkeypatch):
+    caller = Caller(HILL, {}, 20.0)
+    with monkeypatch.context() as patch:
+        patch.setattr("workers.host.caller.start_child", lambda start: (_ for _ in ()).throw(BlockingIOError()))
+        with pytest.raises(BlockingIOError):
+            caller(np.zeros(3, np.float32), 0)
+    assert np.isfinite(caller(np.zeros(3, np.float32), 0)[0])
+    caller.close()
