@@ -53,11 +53,11 @@ def status(
     if follow:
         names = ", ".join(run.name for run in runs_of(folders[0]))
         raise ConfigError(f"--follow: needs one run; {folders[0]} has several: {names}")
-    shown = _print_standings(folders) if as_json else print_overview(console, folders)
+    shown = _print_statuses(folders) if as_json else print_overview(console, folders)
     raise typer.Exit(0 if shown else 1)
 
 
-def _print_standings(folders: list[Path]) -> bool:
+def _print_statuses(folders: list[Path]) -> bool:
     """Print a list with an object for each run; return whether all runs could be read."""
     statuses: list[dict[str, Any]] = []
     for folder, data in of_each(folders, lambda run: status_data(read_status(api.open_run(run)))):

@@ -226,12 +226,12 @@ class Engine(Generic[AnyTransport]):
             # may get one. Only one work item is charged for that, since all other workers are then asked first.
             self._handle(message)
         self._phase += 1
-        most = self._state.limits.episodes_together
-        pieces = [[subject_chunk] if most is None else pieces_of(subject_chunk, most) for subject_chunk in work]
+        episodes = self._state.limits.episodes_together
+        pieces = [[subject_chunk] if episodes is None else pieces_of(subject_chunk, episodes) for subject_chunk in work]
         parts = self._parts([piece for of_chunk in pieces for piece in of_chunk])
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
-        most = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
-        self._work, self._results = {item_id: together(part, most) for item_id, part in parts}, {}
+        policies = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
+        self._work, self._results = {item_id: together(part, policies) for item_id, part in parts}, {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         self._tell_waits()
 

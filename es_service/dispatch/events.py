@@ -107,7 +107,7 @@ def key_of(limit: str) -> str:
 
 @dataclass(frozen=True)
 class Submit:
-    """New work items, to be assigned in this order. `step` raises ValueError if an id has not been delivered yet."""
+    """New work items, to be assigned in this order; `scheduler.handle` raises ValueError for an id that is waiting."""
 
     items: tuple[WorkItem, ...]
 
@@ -153,7 +153,8 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Result:
-    """A worker has answered a work item. The engine keeps the result if the step commands `Deliver`, else drops it."""
+    """A worker has answered a work item. The engine keeps the result if the scheduler commands `Deliver`, else
+    drops it."""
 
     worker: int
     item_id: Hashable
@@ -191,7 +192,7 @@ class Drain:
 @dataclass(frozen=True)
 class SetWorkers:
     """The wanted number of workers changes. If it shrinks, workers without a place are stopped first, then those that
-    have not come up; then the newest are drained. `step` raises ValueError below 1."""
+    have not come up; then the newest are drained. `scheduler.handle` raises ValueError below 1."""
 
     workers: int
 

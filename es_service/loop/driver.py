@@ -222,15 +222,15 @@ def evaluate(
 def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations: Evaluations, clock: Clock) -> Update:
     """Weigh the noise, estimate gradients, step, evaluate the new centres, and tell the search."""
     config, algorithm, generation = search.config, search.algorithm, proposal.generation
-    moved, new_centres = proposal.search, proposal.centres
+    stepped, new_centres = proposal.search, proposal.centres
     if proposal.asked:
-        moved, new_centres = _step(search, evaluator, proposal, evaluations.populations, clock)
+        stepped, new_centres = _step(search, evaluator, proposal, evaluations.populations, clock)
     resets = "by_ask" if proposal.asked else "by_chunk"
     results = evaluate_centres(evaluator, new_centres, config.search.evaluation_episodes, resets=resets)
     clock.lap("seconds_evaluation")
     if not proposal.asked:
         require_some_finite(results, config.task.environment)
-        evaluated = initial_centres(new_centres, results, config, moved.weight.value)
+        evaluated = initial_centres(new_centres, results, config, stepped.weight.value)
     else:
         evaluated = in_ask_order(
             proposal.asked,
@@ -241,11 +241,11 @@ def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations
             fitness_weight=proposal.search.weight.value,
         )
     told = told_of(evaluated, generation)
-    learned = tell(algorithm, moved, told)
+    learned = tell(algorithm, stepped, told)
     nearest, novelty_N = config.novelty, np.full(len(told), np.nan)
     if proposal.asked:
         how = {"neighbours": nearest.neighbours, "distance": nearest.distance, "newest": nearest.newest}
-        novelty_N = novelty(moved.archive, told.descriptor_N_B, **how)
+        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **how)
     return Update(learned, evaluated, told, novelty_N)
 
 
@@ -266,15 +266,15 @@ def _step(
     else:
         gradients = estimate_gradients(evaluator, generation, weights, block_pairs)
     clock.lap("seconds_gradient")
-    moved = proposal.search
+    stepped = proposal.search
     for ask, gradient_D in zip(asks, gradients, strict=True):
-        moved = algorithm.step(moved, ask, gradient_D)
-        require_state(moved, "step", generation)
+        stepped = algorithm.step(stepped, ask, gradient_D)
+        require_state(stepped, "step", generation)
     # New centres are evaluated with the observation statistics of the generation's start.
     new_centres = [
-        replace(centre, parameters_D=moved.centres[ask.centre].centre_D)
+        replace(centre, parameters_D=stepped.centres[ask.centre].centre_D)
         for ask, centre in zip(asks, proposal.centres, strict=True)
     ]
     require_finite(new_centres, config.search, generation)
     clock.lap("seconds_driver")
-    return moved, new_centres
+    return stepped, new_centres

@@ -39,10 +39,6 @@ class PolicyWork:
             for number, parameters_D in zip(numbers, self._parameters(numbers), strict=True)
         ]
 
-    def policy(self, number: int) -> Centre:
-        """One policy."""
-        return self.policies([number])[0]
-
     def _parameters(self, numbers: Sequence[int]) -> list[FloatArray]:
         if not isinstance(self.parameters_N_D, Recipes):
             return [self.parameters_N_D[number].copy() for number in numbers]
@@ -79,16 +75,14 @@ def policy_work(
     has_none = not (mean_N_O.any() or np.signbit(mean_N_O).any()) and bool((std_N_O == 1.0).all())
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
-        given = parameters_N_D.some(of) if isinstance(parameters_N_D, Recipes) else _contiguous(parameters_N_D[of])
-        of_each = () if has_none else (_contiguous(array[of]) for array in statistics)
+        given = (
+            parameters_N_D.some(of) if isinstance(parameters_N_D, Recipes) else np.ascontiguousarray(parameters_N_D[of])
+        )
+        of_each = () if has_none else (np.ascontiguousarray(array[of]) for array in statistics)
         policies = Policies(first, episodes, seed, traces, given, *of_each, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
         work += with_subject(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
     return PolicyWork(parameters_N_D, *statistics, episodes, work)
-
-
-def _contiguous(array: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(array)
 
 
 def no_statistics(policies: int, observation_size: int) -> tuple[FloatArray, FloatArray]:

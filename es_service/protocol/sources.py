@@ -34,6 +34,8 @@ PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
+NAMED = 5
+"""Names of files in a sentence."""
 SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
@@ -95,9 +97,9 @@ def other_files(ours: Sources, theirs: Sources) -> list[str]:
     return sorted(name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name))
 
 
-def in_words(files: list[str], most: int = 5) -> str:
-    """The first `most` of some names of files, and how many others there are."""
-    return ", ".join(files[:most]) + (f" and {len(files) - most} others" if len(files) > most else "")
+def in_words(files: list[str]) -> str:
+    """The first NAMED of some names of files, and how many others there are."""
+    return ", ".join(files[:NAMED]) + (f" and {len(files) - NAMED} others" if len(files) > NAMED else "")
 
 
 class OtherCodeError(Exception):

@@ -106,11 +106,11 @@ def _y_range(chart: Chart) -> tuple[float, float]:
     return (0.0, min(100.0, high) if high > 0 else 1.0) if chart.percent else (low, high)
 
 
-def axis_lines(frame: Frame, label: str, unit: str = "", most: int = 6) -> Markup:
+def axis_lines(frame: Frame, label: str, unit: str = "") -> Markup:
     """Grid lines, tick labels, and the label of the horizontal axis."""
     content = []
     bottom, right = frame.top + frame.height, frame.left + frame.width
-    across, up = ticks(*frame.x, most=most), ticks(*frame.y, most=5)
+    across, up = ticks(*frame.x, most=6), ticks(*frame.y, most=5)
     for value in up:
         y = f"{float(frame.down(value)):.1f}"
         text = tick_text(value, _step(up)) + unit

@@ -54,9 +54,7 @@ def map_view(data: RunData) -> MapView:
     return MapView(figure, explanation, cells, _path_figure(data) if frame is None else None)
 
 
-def draw_map(
-    data: RunData, colours: Range | None = None, width: float = floor.WIDTH
-) -> tuple[Markup, str, Frame | None]:
+def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, Frame | None]:
     """Figure, explanation, and for two dimensions the frame of the plane.
 
     Args:
@@ -68,7 +66,7 @@ def draw_map(
     level_N = level(map_.fitness_N, *colours)
     dimensions = len(map_.geometry.bounds)
     if dimensions == 2:
-        frame = floor.plan_frame(map_.geometry.bounds, width)
+        frame = floor.plan_frame(map_.geometry.bounds, floor.WIDTH)
         shapes = (
             _rectangles(map_, frame, level_N) if isinstance(map_.geometry, Grid) else _voronoi(map_, frame, level_N)
         )
@@ -98,15 +96,15 @@ def empty_pattern() -> Markup:
     return tag("svg", tag("defs", pattern), class_="defined", aria_hidden="true")
 
 
-def colour_bar(colours: Range, label: str = "fitness", *, cells: bool = False) -> Markup:
-    """Legend of the colours of values; `cells`: with the hatching of empty cells."""
+def colour_bar(colours: Range, *, cells: bool = False) -> Markup:
+    """Legend of the colours of fitness; `cells`: with the hatching of empty cells."""
     steps = [tag("rect", x=f"{100 * i / LEVELS:.3f}%", width="3.3%", height=12, fill=SCALE[i]) for i in range(LEVELS)]
     return tag(
         "div",
         tag("span", number(colours[0])),
-        tag("svg", *steps, class_="scale", height=12, role="img", aria_label=f"Colours of {label}"),
+        tag("svg", *steps, class_="scale", height=12, role="img", aria_label="Colours of fitness"),
         tag("span", number(colours[1])),
-        tag("span", label, class_="note"),
+        tag("span", "fitness", class_="note"),
         tag("span", tag("svg", tag("rect", width=22, height=10, class_="ground"), class_="swatch cells"), "empty cell",
             class_="key") if cells else None,
         class_="legend",

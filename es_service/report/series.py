@@ -185,9 +185,9 @@ def phase_curves(history: Columns) -> tuple[NDArray[np.float64], Mapping[str, ND
     return thinned(history["generation"], ends_K, "last"), curves
 
 
-def groups(generations: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
-    """End (exclusive) of each group of neighbouring generations, [K]: at most `most` groups, all but the last equal."""
-    size = max(1, -(-generations // most))
+def groups(generations: int) -> NDArray[np.int64]:
+    """End (exclusive) of each group of neighbouring generations, [K], at most MOST_POINTS; all but the last equal."""
+    size = max(1, -(-generations // MOST_POINTS))
     return np.minimum(np.arange(1, -(-generations // size) + 1) * size, generations)
 
 

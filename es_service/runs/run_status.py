@@ -54,11 +54,11 @@ def population_size(constants: Mapping[str, Any]) -> str:
     return next((f"{constants[key]:,} {unit}" for key, unit in sizes.items() if key in constants), "")
 
 
-def newest_runs(folder: Path, most: int = 10) -> list[Path]:
-    """The runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
+def newest_runs(folder: Path) -> list[Path]:
+    """The ten runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
     databases = {run: run / DATABASE for run in runs_inside(folder)}
     written = {run: file.stat().st_mtime for run, file in databases.items() if file.exists()}
-    return sorted(written, key=lambda run: written[run], reverse=True)[:most]
+    return sorted(written, key=lambda run: written[run], reverse=True)[:10]
 
 
 def read_status(run: Run) -> RunStatus:

@@ -84,7 +84,7 @@ def test_the_driver_makes_a_policy_with_the_bits_that_a_worker_makes():
     theirs = np.concatenate([subject.parameters_N_D.made() for subject, _ in work.work])
     for number, centre in zip([3, 19, 3, 0], work.policies([3, 19, 3, 0]), strict=True):
         assert bits(centre.parameters_D) == bits(theirs[number])
-    assert bits(work.policy(7).parameters_D) == bits(theirs[7])
+    assert bits(work.policies([7])[0].parameters_D) == bits(theirs[7])
 
 
 def test_a_name_is_that_of_the_content():
@@ -198,7 +198,7 @@ def descendants(generations: int, size: int, policies: int = 32):
         work = policy_work(asked, no_statistics(policies, 2), 1, seed=0, generation=generation)
         yield work.work
         for number in rng.integers(policies, size=2).tolist():
-            parents[rng.integers(len(parents))] = work.policy(number).parameters_D
+            parents[rng.integers(len(parents))] = work.policies([number])[0].parameters_D
 
 
 @pytest.mark.parametrize("most", [1, 15, 1000])
@@ -226,7 +226,7 @@ def test_parents_that_a_worker_lacks_are_made_after_what_they_are_made_of():
         work = policy_work(asked, no_statistics(4, 2), 1, seed=0, generation=generation)
         if generation != 1:
             assert made(worker.item(work.work)) == made(work.work)
-        parents = [work.policy(number).parameters_D for number in range(2)]
+        parents = [work.policies([number])[0].parameters_D for number in range(2)]
     assert [isinstance(given, Origin) for given in worker.received] == [False] * 2 + [True] * 4
 
 
