@@ -30,7 +30,7 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
 from es_service.runs.checked_config import load_config
-from es_service.runs.session import OnNotice, Outcome
+from es_service.runs.session import CallerLeft, OnNotice, Outcome
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
 from workers.asking import Rows, Told, gradients, results_of, rows_of
@@ -39,10 +39,6 @@ from workers.host.policies import LanePolicies
 MOST_STEPS = 2**31 - 1
 """Most environment steps of an episode."""
 LEFT = "the block of ask_tell was left; make the same call again to go on"
-
-
-class _Closed(BaseException):
-    """The caller has left the block; raised in the thread of the run."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,7 @@ class AskTell:
                 self._asked = asked
             case Outcome() as outcome:
                 self.outcome = outcome
-            case _Closed():
+            case CallerLeft():
                 self._error = EvaluationError(LEFT)
                 raise self._error
             case BaseException() as error:
@@ -202,7 +198,7 @@ class _CallersEpisodes:
         shown = rows.parameters_N_D, rows.mean_N_O, rows.std_N_O, rows.seed_N, rows.is_noisy_N
         between._from_run.put(Asked(work[0][1].generation, *shown, rows, self._spec))
         if (told := between._to_run.get()) is None:
-            raise _Closed
+            raise CallerLeft
         return results_of(self._spec, work, told)
 
     def wait_for_place(self) -> None:
@@ -257,7 +253,7 @@ def ask_tell(
         try:
             outcome = run_or_resume(wanted, folder, on_notice=on_notice, progress=False, caller=caller)
             search._from_run.put(outcome)
-        except BaseException as error:  # also _Closed; the caller's thread raises it
+        except BaseException as error:  # also CallerLeft; the caller's thread raises it
             search._from_run.put(error)
 
     thread = threading.Thread(target=work, name=f"run in {folder}", daemon=True)

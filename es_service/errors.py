@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from textwrap import indent
 from typing import Any, Literal
 
-Action = Literal["run", "resume", "fork", "watch", "report", "certify", "install"]
+Action = Literal["run", "resume", "fork", "watch", "report", "certify", "ask_tell", "install"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class WayOut:
     """A remedy for an error: a function of this package and its arguments."""
 
     action: Action
-    """run, resume and fork are functions; watch stands for `open_run`, report for `write_report`, certify for
+    """run, resume, fork and ask_tell are functions; watch stands for `open_run`, report for `write_report`, certify for
     `certify_run`, and install for an installation of an extra."""
     purpose: str
     """What it achieves, as words that follow "to", such as "continue it"."""
@@ -53,6 +53,8 @@ class WayOut:
                 config = repr(self.config) if self.config else "config"
                 config = f"load_config({config}, {settings})" if settings else config
                 return f"run({config}, {self.out!r})" if self.out else f"run({config})"
+            case "ask_tell":
+                return f"ask_tell(config, {self.run!r})"
             case "watch":
                 return f"open_run({self.run!r})"
             case "report":

@@ -50,6 +50,8 @@ def way_command(way: WayOut) -> str:
     match way.action:
         case "install":
             return way.call()
+        case "ask_tell":
+            return f"{way.call()} in the program that computes the episodes"
         case "watch":
             return command("status", folder, "--follow")
         case "report":

@@ -41,15 +41,16 @@ def polish(
     log_level: LogLevelOption = None,
 ) -> None:
     """Start a new run that improves policies of another one, and certify both; search.objective says what improves."""
-    from es_service.runs.polishing import certify_both, polish_config
+    from es_service.runs.polishing import certified_for, polish_config
 
     chosen = [] if candidates is None else [f"search.candidates={candidates}"]
     wanted = overrides([*chosen, *(set_ or ())], seed=seed, workers=workers, engine=engine, address=address)
     config = polish_config(parent, wanted)
     folder = out if out is not None else api.default_folder(config)
-    session(folder, partial(api.run, config, folder), log)
     tell = partial(print_notice, errors)
-    before, after = certify_both(api.open_run(parent), api.open_run(folder), config, workers, tell)
+    before = certified_for(api.open_run(parent), config, tell, workers=workers)  # first: a driver may hold the parent
+    session(folder, partial(api.run, config, folder), log)
+    after = certified_for(api.open_run(folder), config, tell, workers=workers, centre=True)
     for what, certified in (("before", before), ("after", after)):
         print_line(console, f"certified {what} polishing:")
         print_certified(console, certified)

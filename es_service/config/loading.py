@@ -166,7 +166,9 @@ def _load(
             sentence = f"{key}: {show(given)} is not a known {what}; must be {allowed}{hint}"
             unknown.append(Problem(sentence, key, given, allowed, meant))
         except ConfigError as error:
-            unknown.append(Problem(f"{key}: {error}", key, given))
+            where = error.field or key
+            sentence = str(error) if error.field else f"{key}: {error}"
+            unknown.append(Problem(sentence, where, chosen.get(where)))
     task: TaskSpec | None = selected.get("task.environment")
     method = selected.get("search.algorithm")
     settings: type[SearchConfig] | None = None if method is None else method.settings

@@ -37,7 +37,7 @@ def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
         what = f"cannot be accessed ({getattr(error, 'strerror', error)})"
     else:
         what = "" if stat.S_ISDIR(status.st_mode) else "is a file"
-    allowed = "the folder of another run, or null"
+    allowed = "the folder of another run, with :best or a cell as :3,17 after it if wanted, or null"
     return (
         [problem_of("search.init_from", start, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []
     )

@@ -113,7 +113,8 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
         raise ConfigError(f"{name} could not be imported or described:\n{process.stderr.strip()}")
     answer = json.loads(lines[-1])
     if "problem" in answer:
-        raise ConfigError(answer["problem"])
+        problem = answer["problem"]
+        raise ConfigError(problem, field="task.descriptor" if problem.startswith("task.descriptor") else None)
     return task_from_fields(answer["task"])
 
 

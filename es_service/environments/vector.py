@@ -72,8 +72,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             ValueError: another argument is wrong.
         """
         for name, value in (("num_envs", num_envs), ("threads", threads), ("max_episode_steps", max_episode_steps)):
-            if value is not None and value < 1:
-                raise ValueError(f"{name} = {value!r}; must be at least 1")
+            if value is not None and (not isinstance(value, int | np.integer) or value is True or value < 1):
+                raise ValueError(f"{name} = {value!r}; must be at least 1, and a whole number")
         require_mode(render_mode)
         self.render_mode, self._copies = render_mode, copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -226,6 +226,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             return [seed_given(int(seed) + lane) for lane in range(self.num_envs)]
+        if isinstance(seed, str) or any(not isinstance(one, int | np.integer | None) for one in seed):
+            raise ValueError(f"seed = {seed!r}; must be a whole number, or a list of these or None")
         if len(seed) != self.num_envs:
             raise ValueError(
                 f"seed is a list of {len(seed)}; must have one for each of the {self.num_envs} environments"

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from es_service.config.model import RunConfig
+from es_service.errors import ConfigError
 from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
@@ -40,6 +41,16 @@ class Stop:
 
     reason: str
     """Why the session ends, in words."""
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError if there are no words, since every reader of the run shows them."""
+        if not isinstance(self.reason, str) or not self.reason.strip():
+            raise ConfigError(
+                f"Stop({self.reason!r}): the reason must be words that say why the session ends",
+                field="reason",
+                value=self.reason,
+                allowed="words",
+            )
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,16 @@ from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
-from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, measure_of, stored
+from es_service.runs.certified import (
+    EPISODES,
+    MEASURES,
+    Certified,
+    Measure,
+    arrays_of,
+    certified_policies,
+    measure_of,
+    stored,
+)
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
@@ -36,8 +45,6 @@ from es_service.runs.selection import Parameters, halved, kept, new_episodes
 from es_service.runs.view import Run, open_run
 from es_service.store.writer import RunStore
 
-EPISODES = 256
-"""Default number of certification episodes."""
 OTHER_PROGRAMS = 2**40
 """Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
 TOP = 10

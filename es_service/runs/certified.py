@@ -18,6 +18,8 @@ from es_service.runs.intervals import mean_interval, share_interval
 from es_service.store.certifications import CertifiedRow
 from es_service.store.reader import read_certifications
 
+EPISODES = 256
+"""Certification episodes of a policy, unless a call says otherwise."""
 Measure = Literal["return", "last_reward", "success", "goal_distance"]
 """What selection episodes rank by; the least goal distance ranks by its negative, since higher is better."""
 MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -119,10 +121,12 @@ def measure_of(fitness: str) -> Measure:
 
 def target_reached(folder: Path, target: float | None, fitness: str) -> str:
     """Why a run is over whose `budget.target_certified` and `task.fitness` these are, in words; empty if no certified
-    policy reaches the target, by whatever it was selected."""
+    policy with EPISODES episodes or more reaches the target, by whatever it was selected."""
     if target is None:
         return ""
     for policy in certified_policies(folder):
+        if policy.episodes.count < EPISODES:
+            continue
         mean = policy.row()[f"{measure_of(fitness)}_mean"]
         if mean is not None and mean >= target:
             return (

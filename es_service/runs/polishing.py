@@ -12,7 +12,7 @@ from es_service.config.search import CandidatesConfig
 from es_service.config.tasks import task_of
 from es_service.errors import NotInRunError
 from es_service.runs.certification import certify_run
-from es_service.runs.certified import Certified, Measure, certified_policies
+from es_service.runs.certified import EPISODES, Certified, certified_policies, measure_of
 from es_service.runs.checked_config import load_config
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
@@ -49,26 +49,30 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
     return load_config({**sections, "search": search, "budget": budget}, overrides)
 
 
-def certify_both(
-    parent: Run, polished: Run, config: RunConfig, workers: int | None, on_notice: Callable[[str], None]
-) -> tuple[list[Certified], list[Certified]]:
-    """Newest certified policies before and after polishing; what is not certified yet is certified now.
+def certified_for(
+    run: Run, config: RunConfig, on_notice: Callable[[str], None], *, workers: int | None, centre: bool = False
+) -> list[Certified]:
+    """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, and
+    selected by the same measure before and after. What is not certified so is certified now.
 
     With a target set in a task that declares success, policies are selected by success.
 
+    Args:
+        config: that of the run that polishes.
+        centre: whether the newest centre is a candidate, too.
+
     Raises:
-        RunLockedError: a driver writes to one of the runs. Otherwise as `certify_run`.
+        RunLockedError: a driver writes to the run. Otherwise as `certify_run`.
     """
-    search, by = config.search, None
-    if isinstance(search, CandidatesConfig) and isinstance(search.objective, TargetObjective):
-        by = "success" if task_of(config).success else None
-    return _certified(parent, by, False, workers, on_notice), _certified(polished, by, True, workers, on_notice)
-
-
-def _certified(
-    run: Run, by: Measure | None, centre: bool, workers: int | None, on_notice: Callable[[str], None]
-) -> list[Certified]:
-    certified = [policy for policy in certified_policies(run.folder) if by in (None, policy.selected_by)]
+    search, by = config.search, measure_of(config.task.fitness)
+    has_target = isinstance(search, CandidatesConfig) and isinstance(search.objective, TargetObjective)
+    if has_target and task_of(config).success:
+        by = "success"
+    certified = [
+        policy
+        for policy in certified_policies(run.folder)
+        if policy.selected_by == by and policy.episodes.count >= EPISODES
+    ]
     if certified:
         newest = max(policy.number for policy in certified)
         return [policy for policy in certified if policy.number == newest]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from es_service.config.caller import CALLER
 from es_service.config.changes import refused_changes
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
@@ -21,6 +22,7 @@ from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.view import open_run
 from es_service.runs.worker_count import require_cores
 from es_service.search.algorithms import ALGORITHMS
+from es_service.store.folder import CONFIG
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 
@@ -43,7 +45,15 @@ def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, An
     folder = store.folder
     require_cores(config, WayOut("resume", "", str(folder), asked))
     if changes := changes_from(store.meta.constants, config):
-        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_status(open_run(folder))))
+        refusal = refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_status(open_run(folder))))
+        if config.task.environment == CALLER:
+            refusal.ways_out = (WayOut("ask_tell", "begin another run with these settings", "ANOTHER_FOLDER"),)
+        elif store.generation is None:
+            purpose = (
+                "begin another run with these settings, since this one has no generation that a fork could continue"
+            )
+            refusal.ways_out = (WayOut("run", purpose, settings=asked, config=str(folder / CONFIG)),)
+        raise refusal
     task = task_of(config)
     if other := _other_task(store.meta.task, task):
         raise ConfigError(

@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from es_service.config.caller import CALLER
 from es_service.config.model import BudgetConfig
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised, spent
@@ -112,6 +113,8 @@ def state(status: RunStatus) -> str:
 
 def how_to_continue(status: RunStatus) -> WayOut:
     """The way to continue a run that is not running."""
+    if status.run.constants["task.environment"] == CALLER:
+        return WayOut("ask_tell", "continue it", str(status.run.folder))
     return WayOut("resume", "continue it", str(status.run.folder), more(status))
 
 

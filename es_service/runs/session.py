@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from es_service.config.model import RunConfig, policy_spec, worker_spec
@@ -18,7 +17,7 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import EvaluationError, Interrupted, StoreError, WayOut
+from es_service.errors import Action, EvaluationError, Interrupted, ServiceError, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
@@ -133,7 +132,7 @@ def work(
     _LOG.info(parallel_sentence(config))
     with (
         _noting_the_end(store.lock),
-        _naming_the_run(store.folder),
+        _naming_the_run(store, "resume" if caller is None else "ask_tell"),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
         make_engine(
@@ -186,6 +185,10 @@ def work(
     return Outcome(open_run(store.folder), reason)
 
 
+class CallerLeft(BaseException):
+    """The caller who computes the episodes has left the block of `ask_tell`; raised in the thread of the run."""
+
+
 @contextmanager
 def _noting_the_end(lock: RunLock) -> Iterator[None]:
     """Keep what ends a session, for whoever asks later why the run stands still."""
@@ -194,19 +197,26 @@ def _noting_the_end(lock: RunLock) -> Iterator[None]:
     except Interrupted as stop:
         lock.note_end(f"interrupted by {signal.Signals(stop.signal_number).name}")
         raise
+    except CallerLeft:
+        lock.note_end("its caller has left the block of ask_tell")
+        raise
+    except ServiceError as error:
+        lock.note_end(" ".join(f"{type(error).__name__}: {error.sentence}".split()))
+        raise
     except BaseException as error:
         lock.note_end(": ".join([type(error).__name__, *filter(None, [" ".join(str(error).split())])]))
         raise
 
 
 @contextmanager
-def _naming_the_run(folder: Path) -> Iterator[None]:
-    """Add to an error of the rollouts the run's folder, and resuming the run as a way out."""
+def _naming_the_run(store: RunStore, action: Action) -> Iterator[None]:
+    """Add to an error of the rollouts the run's folder, and as a way out what continues the run."""
     try:
         yield
     except EvaluationError as error:
-        run = str(folder)
-        resume = WayOut("resume", "continue from the last finished generation after the cause is fixed", run)
+        run = str(store.folder)
+        where = "from the last finished generation" if store.generation is not None else "with its first generation"
+        resume = WayOut(action, f"continue {where} after the cause is fixed", run)
         ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
         error.run, error.ways_out = run, (*ways_out, resume)
         raise

@@ -15,7 +15,7 @@ from typing import Any
 from es_service.config.model import RunConfig
 from es_service.loop.interfaces import Stop
 from es_service.runs.certification import certify_run
-from es_service.runs.certified import certified_policies
+from es_service.runs.certified import EPISODES, certified_policies
 
 BEST = "best"
 """Name of the best centre among the candidates of a certification."""
@@ -39,7 +39,8 @@ def until_due(
     target = config.budget.target_certified
     if target is None:
         return on_generation
-    tested = [policy.stored_fitness for policy in certified_policies(folder) if policy.name == BEST]
+    certified = [policy for policy in certified_policies(folder) if policy.episodes.count >= EPISODES]
+    tested = [policy.stored_fitness for policy in certified if policy.name == BEST]
     most = max((fitness for fitness in tested if fitness is not None), default=-math.inf)
 
     def answer(row: Mapping[str, Any]) -> object:

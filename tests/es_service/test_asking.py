@@ -196,6 +196,24 @@ def test_what_is_no_task_of_the_caller_is_refused_and_so_is_telling_after_the_en
                 search.ask()
 
 
+def test_what_stops_a_run_and_how_it_goes_on_is_told_in_the_caller_s_words(tmp_path):
+    folder = tmp_path / "run"
+    call = f"ask_tell(config, {str(folder)!r})"
+    with ask_tell(config_of("es"), folder) as search:
+        asked = search.ask()
+        with pytest.raises(EvaluationError) as caught:
+            search.tell(np.full(len(asked), np.nan))
+    assert f"continue with its first generation after the cause is fixed: {call}" in str(caught.value)
+    with ask_tell(config_of("es"), folder) as search:
+        search.tell(*told_of(search.ask()))
+    said = CliRunner().invoke(app, ["status", str(folder)]).output
+    assert "its caller has left the block of ask_tell" in " ".join(said.split())
+    assert call in "".join(said.split("\n")).replace(" ", "").replace(",", ", ")
+    with pytest.raises(ConfigError) as refused, ask_tell(config_of("es", seed=5), folder) as search:
+        search.ask()
+    assert [way.action for way in refused.value.ways_out] == ["ask_tell"]
+
+
 def test_readers_know_the_run_and_whoever_would_compute_episodes_says_whose_they_are(tmp_path):
     run = finished(config_of(), tmp_path / "run")
     for words in (["status"], ["report"], ["digest"], ["export", "--to", "csv"]):

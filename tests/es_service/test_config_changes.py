@@ -139,7 +139,7 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
     (tmp_path / "old").rmdir()
     changed = changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
     assert changed.search.init_from == str(tmp_path / "old")
-    with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
+    with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, with :best"):
         load(stored)
 
 

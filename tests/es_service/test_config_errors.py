@@ -78,7 +78,7 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
         ("policy.hidden=[10000000000, 10000000000]", "[10000000000, 10000000000] makes more than 80,000,000 para"),
         ("policy.hidden=[8950, 8950]", "[8950, 8950] makes more than 80,000,000 parameters for point_maze, which"),
-        ("search.init_from=/etc/passwd", "/etc/passwd is a file; must be the folder of another run, or null"),
+        ("search.init_from=/etc/passwd", "/etc/passwd is a file; must be the folder of another run, with :best"),
         ("search.init_from=/etc/passwd/run", "/etc/passwd/run does not exist; must be the folder of another run"),
         ("search.init_from=/" + 300 * "a", f"/{300 * 'a'} cannot be accessed (File name too long); must be the"),
         ('search.init_from="/a\\0b"', "/a\0b cannot be accessed ("),
@@ -150,7 +150,7 @@ def test_a_run_to_start_from_in_a_folder_that_may_not_be_looked_into(tmp_path):
     (tmp_path / "locked").mkdir(mode=0)
     with without_root_rights():
         (line,) = problems(MINIMAL, f"search.init_from={tmp_path}/locked/run")
-    assert "cannot be accessed (Permission denied); must be the folder of another run, or null" in line
+    assert "cannot be accessed (Permission denied); must be the folder of another run, with :best" in line
 
 
 def test_a_cluster_without_ray_is_refused():

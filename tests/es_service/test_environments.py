@@ -290,6 +290,9 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
         (lambda: many(task_options=5), TaskError, "task_options = 5 is no mapping"),
         (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
         (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
+        (lambda: many(max_episode_steps=2.5), ValueError, r"max_episode_steps = 2\.5; must be at least 1, and a whole"),
+        (lambda: many().reset(seed=[1.5, 2]), ValueError, r"seed = \[1\.5, 2\]; must be a whole number, or"),
+        (lambda: many().reset(seed="12"), ValueError, "seed = '12'; must be a whole number, or"),
         (lambda: many(max_episode_steps=0), ValueError, "max_episode_steps = 0; must be at least 1"),
         (
             lambda: many(render_mode="human"),

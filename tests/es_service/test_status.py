@@ -78,6 +78,11 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
             ["centres            2 exploring, 2 exploiting; of the last 12, 50.0 % explored"],
         ),
         ({"algorithm": "ns_es"}, ["weight of fitness  0 (novelty: 1)"]),
+        ({"algorithm": "jedi"}, ["objectives         nearness to targets, and fitness"]),
+        (
+            {"algorithm": "memes", "emitters": 2, "objectives": [{"kind": "novelty"}, {"kind": "goal_distance"}]},
+            ["objectives         novelty, goal_distance"],
+        ),
         ({"algorithm": "map_elites", "batch": 16}, []),
     ],
 )
@@ -88,7 +93,7 @@ def test_what_the_centres_climb_is_told_of_all_and_not_of_the_fittest(search, ex
         config["compute"] = {"engine": "inline", "workers": 1}
     run = api.run(SMALL | config, tmp_path / "run").run
     print_status(console, run)
-    assert re.findall("\n((?:centres|weight of fitness) .*)", capsys.readouterr().out) == expected
+    assert re.findall("\n((?:centres|weight of fitness|objectives) .*)", capsys.readouterr().out) == expected
 
 
 def test_with_one_centre_a_generation_the_share_is_that_of_recent_generations(console, tmp_path, monkeypatch, capsys):

@@ -24,6 +24,23 @@ from workers.rollouts import BACKENDS
 HERE = __name__
 
 
+def test_the_field_of_a_problem_is_the_key_that_names_it():
+    """What the user's function raised comes with its frames in the user's files."""
+    task = {"environment": "python:tests.workers.host_tasks:CornerMaze", "descriptor": "tests.examples.beam:beam"}
+    with pytest.raises(ConfigError) as caught:
+        load_config(
+            {"task": task, "search": {"algorithm": "es"}, "budget": {"generations": 1}},
+            tasks=TASKS,
+            algorithms=ALGORITHMS,
+            rollouts=BACKENDS,
+        )
+    assert caught.value.field == "task.descriptor"
+    assert "cannot unpack" in str(caught.value)
+    assert "beam.py" in str(caught.value)
+    with pytest.raises(ConfigError, match="function:beam has one colon; must be function:module:name"):
+        TASKS["function:beam"]
+
+
 class Still:
     """a point stays where it is"""
 

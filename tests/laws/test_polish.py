@@ -10,7 +10,9 @@ from es_service import api
 from es_service.cli.main import app
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EpisodesResult
-from es_service.runs.polishing import certify_both, polish_config
+from es_service.runs.certification import certify_run
+from es_service.runs.certified import EPISODES
+from es_service.runs.polishing import certified_for, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
@@ -173,5 +175,7 @@ def test_with_a_target_set_policies_are_selected_by_success(parent, tmp_path):
     run = api.run(
         config.model_copy(update={"budget": config.budget.model_copy(update={"generations": 1})}), tmp_path / "run"
     ).run
-    _, after = certify_both(parent, run, config, 1, lambda notice: None)
-    assert [one.selected_by for one in after] == ["success"]
+    certify_run(run.folder, episodes=3, by="success", workers=1)
+    certified = certified_for(run, config, lambda notice: None, workers=1, centre=True)
+    assert [(one.selected_by, one.episodes.count, one.number) for one in certified] == [("success", EPISODES, 2)]
+    assert certified_for(run, config, pytest.fail, workers=1)[0].number == 2, "it is not certified again"

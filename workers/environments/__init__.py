@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, choice
-from es_service.protocol.sources import LIBRARY
+from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -227,6 +227,9 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         from workers.environments import function_task
 
         return function_task.describe(rest)
+    if kind in PATH_FOLLOWS:
+        what = "name" if kind == "function" else "Class"
+        raise TaskError(f"{name} has one colon; must be {kind}:module:{what}, such as {kind}:my_module:{rest or what}")
     from workers.environments import user_task
 
     return user_task.describe(name)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from es_service.protocol.messages import UNBOUNDED, Bounds, DescriptorChoice
+from es_service.protocol.raised import users_error
 from workers.environments import TaskError
 from workers.environments.declared import clashes, import_named, wrong_pairs
 from workers.environments.host_task import HostEnvironment, HostEpisode, HostTask
@@ -59,7 +60,12 @@ def describe_descriptor(
     if isinstance(choice, tuple):
         names = tuple(f"observation_{index}" for index in choice)
         return names, tuple(finite_bounds(*bounds_O[index]) for index in choice)
-    size = _size(task, choice, action_size)
+    try:
+        size = _size(task, choice, action_size)
+    except TaskError:
+        raise
+    except Exception as error:  # the user's function can raise anything
+        raise TaskError(f"task.descriptor = {choice}: {users_error(error, choice) or error}") from None
     name = choice.rpartition(":")[2]
     names = (name,) if size == 1 else tuple(f"{name}_{index}" for index in range(size))
     bounds: Any = (UNBOUNDED,) * size

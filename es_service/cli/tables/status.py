@@ -26,6 +26,8 @@ from es_service.runs.run_status import (
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
+WEIGHED = {"fitness", "novelty", "mixture"}
+"""Kinds of objectives that the weight of fitness beside novelty describes."""
 SHOWN_PARAMETERS = 12
 """Most parameters of a function that `status` shows; an export has all of them."""
 
@@ -109,7 +111,7 @@ def _progress(status: RunStatus) -> dict[str, str]:
         **goal,
         **filled,
         "novelty archive": f"{last['archive_size']:,} centres",
-        **_objectives(recent),
+        **_objectives(status.run, recent),
         "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
         **_faults(recent, last["generation"]),
@@ -130,9 +132,14 @@ def _parameters(status: RunStatus) -> dict[str, str]:
     return {"best parameters": f"{shown}{more}"}
 
 
-def _objectives(recent: Recent) -> dict[str, str]:
+def _objectives(run: Run, recent: Recent) -> dict[str, str]:
     """What the centres of the newest generation climb; nothing if it moved none, or if that is not known."""
-    newest, all_ = recent.newest, recent.objectives
+    newest, all_, search = recent.newest, recent.objectives, run.meta.config["search"]
+    chosen = [
+        objective["kind"] for objective in (search.get("objective"), *(search.get("objectives") or ())) if objective
+    ]
+    if not {*chosen} <= WEIGHED or "target_weight" in search:  # a place or a distance beside fitness
+        return {"objectives": ", ".join(dict.fromkeys(chosen)) or "nearness to targets, and fitness"}
     if newest is None or all_ is None:
         return {}
     if all_.are_separate:
