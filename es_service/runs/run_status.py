@@ -79,7 +79,7 @@ def status_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Ru
         key = ".".join(map(str, ("budget", *first["loc"])))
         return RunStatus(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
     try:
-        certified = target_reached(run.folder, budget.target_certified, run.present_config["task"]["fitness"])
+        certified = target_reached(run.folder, budget.target_certified, run.meta.config["task"]["fitness"])
     except StoreError:
         certified = ""  # damage of a certification, which `verify` names
     end = "" if driver else last_end(run.folder)
