@@ -113,7 +113,8 @@ def test_a_user_s_own_error_comes_first_with_the_frames_of_the_user_s_files(fold
     assert printed.startswith(first)
     assert places(folder, printed) == frames
     assert not FOREIGN.search(printed.replace(str(folder), ""))
-    assert re.search("to continue (from the last finished|with its first) generation .*resume", printed.splitlines()[-1])
+    way_out = "to continue (from the last finished|with its first) generation .*resume"
+    assert re.search(way_out, printed.splitlines()[-1])
 
 
 @pytest.mark.parametrize(
