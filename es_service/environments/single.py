@@ -22,8 +22,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     """One environment of a task, with the bits of environment `index` of a `TaskVectorEnv` with the same seed.
 
     `info` has `descriptor` [B] (where the episode would end in the map), `success`, and `goal_distance` if the task has
-    a goal. Actions outside of [-1, 1] are clipped. It has no limit of steps: `gymnasium.make`
-    adds that of a shipped task, and for others the one that it is given (`max_episode_steps`).
+    a goal. Actions outside of [-1, 1] are clipped. It has no limit of steps: `gymnasium.make` adds that of a shipped
+    task, and for others the one that it is given (`max_episode_steps`).
     """
 
     metadata = {"render_modes": list(MODES), "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - as Gymnasium's

@@ -8,7 +8,7 @@ import pytest
 from es_service import api
 from es_service.runs import run_status
 from es_service.runs.certification import certify_run
-from es_service.runs.certified import certified_policies
+from es_service.runs.certified import certified_policies, target_reached
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
 
@@ -81,6 +81,17 @@ def test_a_policy_that_was_selected_by_something_else_reaches_the_target_by_its_
     [policy] = certify_run(run.folder, by=by)
     assert policy.row()["return_mean"] < -1, "while goal distances are above it"
     assert run_status.state(run_status.read_status(run)).startswith("finished: the budget of 1 generations")
+
+
+def test_a_certification_of_few_episodes_neither_reaches_the_target_nor_stands_for_the_run_s_own(tmp_path):
+    run = api.run(api.load_config(CONFIG, ["budget.generations=1"]), tmp_path / "run").run
+    target = float(run.history["best_fitness"].iloc[-1]) - 1.0
+    [few] = certify_run(run.folder, top=0, episodes=16)
+    assert few.row()["return_mean"] >= target
+    assert target_reached(run.folder, target, "sum") == ""
+    outcome = api.resume(run.folder, {"budget.target_certified": target, "budget.generations": 2})
+    assert outcome.reason.startswith(f"the target {target:g} is reached")
+    assert [one.episodes.count for one in certified_policies(run.folder)] == [16, 256]
 
 
 def test_a_sweep_leaves_alone_what_has_reached_its_target(whole, tmp_path):

@@ -45,6 +45,10 @@ class Worker(DirectEvaluator):
     def wait_for_place(self):
         """Return at once."""
 
+    def begin(self, work):
+        results = self.evaluate(work)
+        return lambda: results
+
     def evaluate(self, work):
         self.generations.update(chunk.generation for _, chunk in work)
         results = super().evaluate(work)
