@@ -156,8 +156,14 @@ class AskTell:
             raise ConfigError(f"steps has {wrong[0]}; must be {allowed}", field="steps", allowed=allowed)
         observed = Moments(0.0, np.zeros(size), np.zeros(size))
         if moments is not None:
-            mean_O, m2_O = (_array("moments", moment, (size,)).astype(np.float64) for moment in moments[1:])
-            observed = Moments(float(moments[0]), mean_O, m2_O)
+            try:
+                number, mean, m2 = moments
+                number = float(number)
+            except (TypeError, ValueError) as error:
+                allowed = f"(count, mean [{size}], sum of squared deviations [{size}])"
+                raise ConfigError(f"moments must be {allowed}: {error}", field="moments", allowed=allowed) from error
+            mean_O, m2_O = (_array("moments", array, (size,)).astype(np.float64) for array in (mean, m2))
+            observed = Moments(number, mean_O, m2_O)
         self._asked = None
         self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed))
         self._receive()

@@ -76,8 +76,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         action_A = np.asarray(action, np.float32)
         if action_A.shape != self.action_space.shape:
             raise ValueError(f"action has the shape {action_A.shape}; must be {self.action_space.shape}")
-        if not self._is_seeded:
-            raise ValueError("call reset before step")
+        self._require_reset("step")
         seen = self._lanes.step(action_A[None])
         if self._trails is not None:
             self._trails.move(_FIRST, seen.descriptor)
@@ -88,7 +87,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return None if self._trails is None else self._trails.frame(0)
 
     def get_state(self) -> LanesState:
-        """State of the environment, from which `set_state` of another one of the task goes on, bit for bit."""
+        """State of the environment, from which `set_state` of another one of the task goes on, bit for bit. Raises
+        ValueError before the first reset."""
+        self._require_reset("get_state")
         return self._lanes.state()
 
     def set_state(self, state: LanesState) -> None:
@@ -102,6 +103,10 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         """End the process of a task that xla computes."""
         self._is_closed = True
         self._lanes.close()
+
+    def _require_reset(self, before: str) -> None:
+        if not self._is_seeded:
+            raise ValueError(f"call reset before {before}")
 
     def _info(self, seen: Seen) -> dict[str, Any]:
         shown = {name: array[0] for name, array in info_of(self.task, seen).items()}

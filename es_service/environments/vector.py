@@ -129,8 +129,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         action_N_A = np.asarray(actions, np.float32)
         if action_N_A.shape != self.action_space.shape:
             raise ValueError(f"actions have the shape {action_N_A.shape}; must be {self.action_space.shape}")
-        if not self._is_seeded_N.all():
-            raise ValueError("call reset before step")
+        self._require_reset("step")
         over_before_N = self._is_over_N
         if self.autoreset_mode == AutoresetMode.DISABLED and over_before_N.any():
             which = np.flatnonzero(over_before_N)
@@ -163,7 +162,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         return self._returned(), reward_N, terminated_N, truncated_N, info
 
     def get_state(self) -> State:
-        """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit."""
+        """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit. Raises
+        ValueError before the first reset."""
+        self._require_reset("get_state")
         return self._lanes.state(), self._is_over_N.copy(), self._observation_N_O.copy()
 
     def set_state(self, state: State) -> None:
@@ -177,9 +178,12 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             self._trails.forget()
 
     def frame(self, index: int) -> NDArray[np.uint8]:
-        """Picture of one environment, [256, 256, 3]. Raises ValueError if `render_mode` is None."""
+        """Picture of one environment, [256, 256, 3]. Raises ValueError if `render_mode` is None, or if there is no such
+        environment."""
         if self._trails is None:
             raise ValueError("render_mode = None; must be 'rgb_array' for pictures")
+        if not 0 <= index < self.num_envs:
+            raise ValueError(f"index = {index}; must be from 0 to {self.num_envs - 1}")
         return self._trails.frame(index)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -189,6 +193,10 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **_: Any) -> None:
         """End the threads and processes."""
         self._lanes.close()
+
+    def _require_reset(self, before: str) -> None:
+        if not self._is_seeded_N.all():
+            raise ValueError(f"call reset before {before}")
 
     def _begin(self, lane_M: NDArray[np.intp]) -> Seen:
         """Reset some environments; returns what is seen in these."""

@@ -29,12 +29,14 @@ MOST_FILES = 1000
 
 
 def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
-    """That workers compile for a kind of chunk, and about how long it takes.
+    """That workers compile for a kind of chunk, and about how long it takes; that they start, if they compile nothing.
 
     Args:
         here: whether they are on this machine; of others it is not known what they have on disk.
     """
     first_s, again_s = BACKENDS[spec.rollout].compile_s
+    if not first_s:
+        return f"starting workers for {spec.environment} ({CONTENTS[kind]})"
     if not here:
         how_long = f"about {first_s} s the first time"
     elif was_compiled(spec, kind):

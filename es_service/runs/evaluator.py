@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from threading import Lock
 from types import TracebackType
 from typing import Any, Literal, NoReturn
 
@@ -94,7 +95,7 @@ class PolicyEvaluations:
 
 
 class PolicyEvaluator:
-    """Callable that evaluates policies; `evaluator` makes one. It may be called from one thread at a time."""
+    """Callable that evaluates policies; `evaluator` makes one. Calls from several threads wait for each other."""
 
     def __init__(self, config: RunConfig, task: TaskSpec, engine: Engine[Any]) -> None:
         self.config = config
@@ -104,6 +105,7 @@ class PolicyEvaluator:
         """Number of parameters of a policy, D."""
         self._engine = engine
         self._closed = ""
+        self._in_turn = Lock()
 
     def initial(self, number: int = 0) -> FloatArray:
         """Parameters [D] with which a run of this config would begin, those of centre `number`: see `policy.init`."""
@@ -137,8 +139,6 @@ class PolicyEvaluator:
             ConfigError: an argument is wrong; `field` names it.
             EvaluationError: the rollouts cannot continue, after which the evaluator is closed; or it is closed.
         """
-        if self._closed:
-            raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
         policies_N_D = policies_of(self.config, self.task, parameters)
         statistics = statistics_of(self.task, len(policies_N_D), observation_mean, observation_std)
         asked = policy_work(
@@ -148,11 +148,14 @@ class PolicyEvaluator:
             seed=self.config.seed if seed is None else whole("seed", seed, 0),
             generation=whole("generation", generation, 0),
         )
-        try:
-            answers = self._engine.evaluate(asked.work)
-        except BaseException as error:  # also an interrupt: the engine may have stopped at any point
-            self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
-            raise
+        with self._in_turn:
+            if self._closed:
+                raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
+            try:
+                answers = self._engine.evaluate(asked.work)
+            except BaseException as error:  # also an interrupt: the engine may have stopped at any point
+                self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
+                raise
         result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
         return PolicyEvaluations(
             result.fitness,

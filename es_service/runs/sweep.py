@@ -130,7 +130,7 @@ def run_planned(
         )
         if left:
             todo = f"{len(left)} of {len(runs)} runs to do in {out}, {shares.at_once} at a time"
-            on_notice(f"{todo}; workers of each: {shares.workers[0]}")
+            on_notice(f"{todo}; workers of each: {' or '.join(dict.fromkeys(map(str, shares.workers)))}")
         running: dict[str, _Child] = {}
         shown, read_s = None, float("-inf")
         try:

@@ -165,6 +165,8 @@ def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
         ({"fitness": np.zeros(2), "steps": [0, 1]}, "steps"),
         ({"fitness": np.zeros(2), "steps": [1, 2**31]}, "steps"),
         ({"fitness": np.zeros(2), "moments": (1.0, [0.0, 1.0], [0.0])}, "moments"),
+        ({"fitness": np.zeros(2), "moments": 3}, "moments"),
+        ({"fitness": np.zeros(2), "moments": ("many", [0.0, 1.0], [0.0, 1.0])}, "moments"),
     ],
 )
 def test_a_wrong_argument_is_named_and_the_next_call_works(arguments, field, tmp_path):

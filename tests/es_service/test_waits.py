@@ -63,6 +63,8 @@ def test_what_was_compiled_before_is_remembered_with_all_that_the_code_depends_o
         "compiling for point_maze (evaluation episodes, compiled before, about 6 s)"
     )
     assert "(evaluation episodes, about 15 s the first time)" in compiling_sentence(spec(), kind, here=False)
+    starting = compiling_sentence(spec(rollout="host"), kind, here=True)
+    assert starting == "starting workers for point_maze (evaluation episodes)", "they compile nothing"
     assert was_compiled(spec(seed=9), kind)
     changed = (spec(episode_steps=9), spec(rollout="simd"), spec(sources={"workers/worker.py": "0"}))
     assert not any(was_compiled(one, kind) for one in changed)

@@ -88,6 +88,12 @@ def test_bits_are_the_same_with_any_workers_and_engine(reference, where):
     assert children() == before
 
 
+def test_calls_from_several_threads_wait_for_each_other(reference):
+    with es_service.evaluator(CONFIG, workers=2) as evaluate, ThreadPoolExecutor(4) as threads:
+        made = threads.map(lambda _: twice(evaluate), range(4))
+        assert all(bits_of_two == reference for bits_of_two in made)
+
+
 def test_transitions_are_the_same_with_any_workers_and_change_no_other_bit(reference):
     found = all_steps(workers=1)
     assert found == all_steps(workers=3)

@@ -38,7 +38,7 @@ class Host(RolloutBackend):
 
     name = "host"
     task_kinds = ("python", "function")
-    compile_s = (1, 1)
+    compile_s = (0, 0)
     chunk_pairs = (8, 8)
     copies_late_items = False
 
