@@ -68,13 +68,7 @@ ABSENT = "(absent)"
 
 
 def without_derived(values: Mapping[str, Any], wanted: Mapping[str, Any], algorithms: Methods) -> dict[str, Any]:
-    """Resolved values without those that are derived from a key which is about to change.
-
-    Args:
-        values: resolved values of the config.
-        wanted: the values that are about to replace some of them.
-        algorithms: the methods by name.
-    """
+    """Resolved values without those that are derived from a key which `wanted` is about to change."""
     changed = [
         key
         for key in DERIVED_KEYS
@@ -163,9 +157,7 @@ def refused_changes(
     """The error for a resume that would change constants of the run; it lists all of them and the ways out.
 
     Args:
-        run: folder of the run.
         changes: (dotted key, old value, new value) of each constant, as `changed_constants` returns them.
-        algorithms: the methods by name.
         besides: further keys that a fork must set, and their values.
     """
     fixed = [name for name, old, new in changes if does_not_fit(name, old, new, algorithms) or name in START_KEYS]

@@ -174,11 +174,7 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
 
 def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     """The problem of an unknown key. It suggests the same name in another section, else the most similar key; if there
-    is neither, it lists the keys of the section.
-
-    Args:
-        candidates: keys that may have been meant.
-    """
+    is neither, it lists the keys of the section."""
     candidates = dict.fromkeys(candidates)
     section, _, leaf = name.rpartition(".")
     everywhere = {_leaf(key): key for key in candidates}

@@ -48,11 +48,7 @@ def options_of(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:
-    """Value of every option that a task declares by its key, and the problems of the given values.
-
-    Args:
-        values: flat values of a config, of which the options are read.
-    """
+    """Value of every option that a task declares by its key, and the problems of the given values."""
     declared = task.options
     options: dict[str, OptionValue] = {f"{TASK_OPTIONS}{name}": option.default for name, option in declared.items()}
     problems = []

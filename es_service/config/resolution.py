@@ -324,11 +324,7 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
 
 
 def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> list[str]:
-    """Warnings about settings that are valid but probably not intended; the command line prints them before the run.
-
-    Args:
-        rollouts: as for `resolve`.
-    """
+    """Warnings about settings that are valid but probably not intended; the command line prints them before the run."""
     shape, here, names = policy_spec(config, task), config.compute.address is None, [*rollouts]
     faster = names[names.index(chosen := config.compute.rollout) + 1 :]
     warnings = [

@@ -58,10 +58,9 @@ def inline_engine(
     Args:
         spec: constants of the run.
         limits: number of workers, deadlines and numbers of attempts.
-        should_stop: as in `Engine`.
         threads: whether workers are threads of one child, which takes less memory; if one is lost, all are lost.
         gpus: GPUs of each worker, or the share of one. There must be room for `limits.workers`, see `gpus.places`.
-        log, on_compile: as in `Engine`.
+        should_stop, log, on_compile: as in `Engine`.
     """
     return Engine(ChildProcesses(spec, threads=threads, gpus=gpus), limits, should_stop, log, on_compile=on_compile)
 
@@ -153,7 +152,7 @@ class ChildProcesses:
             numbered.append((number, chunk))
         frames += [framed(("parents", parents)) for parents in apart(parents_to_send(work, to.parents))]
         forget_old_subjects(to.subjects)
-        self._subjects.forget_old()
+        forget_old_subjects(self._subjects)
         to.unanswered[item_id, attempt] = work
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)

@@ -6,12 +6,12 @@ import pickle
 from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
+from operator import itemgetter
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce
+from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce, forget_old_subjects
 from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
 from es_service.protocol.recipes import Origin
 
@@ -36,30 +36,19 @@ class Call:
     """Kind of chunks for which it compiles."""
 
 
-class Calls:
+class Calls(dict[Any, Call]):
     """Reference to the answer -> call, oldest first."""
 
     def __init__(self, ray: ModuleType) -> None:
+        super().__init__()
         self._ray = ray
-        self._calls: dict[Any, Call] = {}
         self._ready: deque[Any] = deque()
         """References whose answers are there. Those of a worker that was killed meanwhile do not count."""
 
-    def __len__(self) -> int:
-        return len(self._calls)
-
-    def __getitem__(self, ref: Any) -> Call:
-        return self._calls[ref]
-
-    def __setitem__(self, ref: Any, call: Call) -> None:
-        self._calls[ref] = call
-
-    def __delitem__(self, ref: Any) -> None:
-        del self._calls[ref]
-
     def forget(self, worker: int) -> None:
         """Remove the calls of a worker."""
-        self._calls = {ref: call for ref, call in self._calls.items() if call.worker != worker}
+        for ref in [ref for ref, call in self.items() if call.worker == worker]:
+            del self[ref]
 
     def answered(self, timeout_s: float) -> Any | None:
         """Reference to an answer that is there, which the caller removes; None if none comes within `timeout_s`.
@@ -68,9 +57,9 @@ class Calls:
         travels alone and may overtake an older one, so only the oldest call of each worker is waited for.
         """
         while self._ready:
-            if (ref := self._ready.popleft()) in self._calls:
+            if (ref := self._ready.popleft()) in self:
                 return ref
-        if not self._calls:
+        if not self:
             return None
         refs = list(self._oldest().values())
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
@@ -81,21 +70,14 @@ class Calls:
 
     def owed_first(self) -> dict[int, str]:
         """Worker -> method of its oldest call."""
-        return {worker: self._calls[ref].what for worker, ref in self._oldest().items()}
+        return {worker: self[ref].what for worker, ref in self._oldest().items()}
 
     def _oldest(self) -> dict[int, Any]:
         """Worker -> reference to the answer of its oldest call."""
         oldest: dict[int, Any] = {}
-        for ref, call in self._calls.items():
+        for ref, call in self.items():
             oldest.setdefault(call.worker, ref)
         return oldest
-
-
-class _Stored(NamedTuple):
-    """A parent that Ray has stored."""
-
-    ref: Any
-    nbytes: int
 
 
 class Arguments:
@@ -104,8 +86,8 @@ class Arguments:
     def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
         self._subjects = MadeOnce(self._packed)
-        self._parents: KeptParents[_Stored] = KeptParents(KEPT_BYTES, attrgetter("nbytes"))
-        """Large parents that are stored."""
+        self._parents: KeptParents[tuple[Any, int]] = KeptParents(KEPT_BYTES, itemgetter(1))
+        """Large parents that are stored: their references and bytes."""
 
     def of(self, work: Sequence[Work], kept: KeptParents[int]) -> tuple[Any, ...]:
         """The chunks, their subjects without repetitions, and the parents that a worker lacks, as `WorkerActor.run`
@@ -117,7 +99,7 @@ class Arguments:
         subjects = {id(subject): subject for subject, _ in work}
         of_recipes = {key: subject for key, subject in subjects.items() if recipes_in(subject) is not None}
         others = {key: self._subjects.of(subject) for key, subject in subjects.items() if key not in of_recipes}
-        self._subjects.forget_old()
+        forget_old_subjects(self._subjects)
         index = {key: number for number, key in enumerate([*of_recipes, *others])}
         asked = [as_sent(subject) for subject in of_recipes.values()], [(index[id(of)], chunk) for of, chunk in work]
         parents = self._packed_parents(parents_to_send(work, kept))
@@ -140,8 +122,8 @@ class Arguments:
         for name, values in large.items():
             if name not in self._parents:
                 ref = self._ray.put(pickle.dumps({name: values}, pickle.HIGHEST_PROTOCOL))
-                self._parents.add(name, _Stored(ref, values.nbytes))
-        packed = [self._parents[name].ref for name in large]
+                self._parents.add(name, (ref, values.nbytes))
+        packed = [self._parents[name][0] for name in large]
         packed += [pickle.dumps(small, pickle.HIGHEST_PROTOCOL)] if small else []
         self._parents.needed(large)
         return packed

@@ -135,12 +135,20 @@ def cores_of_nodes(ray: ModuleType) -> list[int]:
 
 
 def read_membership(ray: ModuleType, claim: Claim) -> Membership:
-    """The nodes of the cluster now. Raises an exception of Ray if its head node does not answer."""
+    """The nodes of the cluster now. Raises an exception of Ray if its head node does not answer.
+
+    Ray has no public function for the nodes that are being drained, nor for what nobody uses of a node. If a version of
+    Ray lacks the first of these two, the workers of a drained node are lost when the node ends. If it lacks the second,
+    no node counts as free, and Ray chooses.
+    """
     ask_head(ray)
-    leaving = frozenset(_draining(ray))
+    leaving, unused = frozenset[str](), dict[str, dict[str, float]]()
+    with contextlib.suppress(AttributeError):
+        leaving = frozenset(ray._private.state.state.get_draining_nodes())
     alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
     rooms = {node: _room(resources, claim) for node, resources in alive.items() if node not in leaving}
-    unused = _unused(ray)
+    with contextlib.suppress(AttributeError):
+        unused = ray._private.state.available_resources_per_node()
     free = {node: _room(unused.get(node, {}), claim) for node in rooms}
     return Membership(rooms, free, leaving, frozenset(alive))
 
@@ -164,8 +172,11 @@ def shortage(ray: ModuleType, claim: Claim, nodes: Membership | None) -> str:
     Args:
         nodes: those of the cluster that was joined; None: a Ray of our own, which has room.
     """
-    if nodes is not None and not _answers(ray):
-        return f"Each worker needs {claim}; the head node of the cluster does not answer"
+    if nodes is not None:
+        try:
+            ask_head(ray)
+        except Exception:  # of several classes
+            return f"Each worker needs {claim}; the head node of the cluster does not answer"
     if nodes is None:
         advice = "The processes of the workers do not start or are very slow"
     elif nodes.room:
@@ -193,14 +204,6 @@ def ask_head(ray: ModuleType) -> None:
         ray._private.worker.global_worker.gcs_client.check_alive([], timeout=HEAD_S)
 
 
-def _answers(ray: ModuleType) -> bool:
-    try:
-        ask_head(ray)
-    except Exception:  # of several classes
-        return False
-    return True
-
-
 def _room(resources: dict[str, float], claim: Claim) -> int:
     """Number of workers for which a node with these resources has room."""
     by_cpu = int(resources.get("CPU", 0.0) / claim.cpus)
@@ -214,24 +217,3 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
 def _resources(amounts: dict[str, float]) -> str:
     """Text with the numbers of CPUs and GPUs."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
-
-
-def _unused(ray: ModuleType) -> dict[str, dict[str, float]]:
-    """Node id -> resources that nobody uses now.
-
-    Ray has no public function for this. If a version of Ray lacks this one, no node counts as free, and Ray chooses.
-    """
-    with contextlib.suppress(AttributeError):
-        return ray._private.state.available_resources_per_node()
-    return {}
-
-
-def _draining(ray: ModuleType) -> dict[str, int]:
-    """Ids of the nodes that are being drained, as keys.
-
-    Ray has no public function for this. If a version of Ray lacks this one, the workers of a drained node are lost when
-    the node ends.
-    """
-    with contextlib.suppress(AttributeError):
-        return ray._private.state.state.get_draining_nodes()
-    return {}

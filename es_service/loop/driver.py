@@ -46,7 +46,7 @@ from es_service.loop.generation import (
     make_centre,
     tell,
 )
-from es_service.loop.history import HistoryRow, fault_columns
+from es_service.loop.history import HistoryRow
 from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, state_from_parts
 from es_service.loop.policies import as_population
@@ -173,7 +173,12 @@ def _generation(
     clock.lap("seconds_driver")
     correction = correct(search, evaluator, elites, state, updated)
     clock.lap("seconds_evaluation")
-    faults = fault_columns(evaluator.counts, since=since)
+    now = evaluator.counts
+    faults: HistoryRow = {
+        "retries": now.retries - since.retries,
+        "lost_workers": now.lost_workers - since.lost_workers,
+        "workers": now.workers,
+    }
     finished = finish(state, proposal, evaluations, updated, correction, faults, store.part, search, clock)
     elites.change(finished.parts)
     return finished
@@ -242,10 +247,9 @@ def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations
         )
     told = told_of(evaluated, generation)
     learned = tell(algorithm, stepped, told)
-    nearest, novelty_N = config.novelty, np.full(len(told), np.nan)
+    novelty_N = np.full(len(told), np.nan)
     if proposal.asked:
-        how = {"neighbours": nearest.neighbours, "distance": nearest.distance, "newest": nearest.newest}
-        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **how)
+        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(config.novelty))
     return Update(learned, evaluated, told, novelty_N)
 
 

@@ -17,16 +17,14 @@ from es_service.loop.history import (
     HistoryRow,
     Table,
     evaluation_columns,
-    map_columns,
     norm,
     or_none,
     population_columns,
-    search_columns,
 )
 from es_service.loop.interfaces import Search
 from es_service.loop.parts import Changes
 from es_service.loop.state import RunState
-from es_service.search.maps.behaviour_map import EMPTY
+from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.observation_statistics import merge_moments
 
 Reachable = NDArray[np.bool_] | None
@@ -104,24 +102,23 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
     table = evaluated_table(evaluated, search.task, cell_N, proposal.start_cells, updated.novelty_N)
     at = fittest(told)  # subject of the history's row
     shown = int(evaluated.index_N[at])
+    of_map: HistoryRow = {}
+    if state.search.map is not None and cell_N is not None:
+        of_map = {
+            "start_cell": proposal.start_cells.get(shown),
+            "cell": None if cell_N[at] == EMPTY else int(cell_N[at]),
+            **map_statistics(state.search.map, search.config.map.qd_offset, reachable),
+        }
     row: HistoryRow = {
         "generation": state.generation,
         "env_steps": state.env_steps,
         "episodes": state.episodes,
         "best_fitness": state.best.fitness,
-        **search_columns(
-            shown,
-            float(evaluated.fitness_weight_N[at]),
-            or_none(updated.novelty_N[at]),
-            state.search.archive.size,
-        ),
-        **map_columns(
-            state.search.map,
-            search.config.map.qd_offset,
-            reachable,
-            cell=None if cell_N is None or cell_N[at] == EMPTY else int(cell_N[at]),
-            start_cell=proposal.start_cells.get(shown),
-        ),
+        "centre": shown,
+        "fitness_weight": float(evaluated.fitness_weight_N[at]),
+        "centre_novelty": or_none(updated.novelty_N[at]),
+        "archive_size": state.search.archive.size,
+        **of_map,
         **finished.correction.columns,
         "update_norm": or_none(evaluated.update_norm_N[at]),
         "parameter_norm": norm(evaluated.point(at).parameters_D),

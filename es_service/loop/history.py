@@ -10,9 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
-from es_service.search.maps.behaviour_map import BehaviourMap, map_statistics
 
 HistoryRow = dict[str, int | float | None]
 """Values by name of the column, as the loop writes them."""
@@ -187,16 +185,6 @@ def with_gaps(values_N: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(values_N < 0, NO_INTEGER, values_N)
 
 
-def search_columns(centre: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
-    """Columns about the search; `centre_novelty` is None in generation 0."""
-    return {
-        "centre": centre,
-        "fitness_weight": fitness_weight,
-        "centre_novelty": centre_novelty,
-        "archive_size": archive_size,
-    }
-
-
 @np.errstate(invalid="ignore", over="ignore")
 def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
     """Number of invalid members, and quartiles of the valid members' fitness and return, of all populations together.
@@ -286,32 +274,9 @@ def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArra
     return columns
 
 
-def map_columns(
-    map_: BehaviourMap | None,
-    qd_offset: float,
-    reachable: NDArray[np.bool_] | None,
-    *,
-    cell: int | None,
-    start_cell: int | None,
-) -> HistoryRow:
-    """Columns about the map, the cell that a generation started from and the cell it entered; empty without a map."""
-    if map_ is None:
-        return {}
-    return {"start_cell": start_cell, "cell": cell, **map_statistics(map_, qd_offset, reachable)}
-
-
 def or_none(value: float) -> float | None:
     """A number, or None for NaN."""
     return None if math.isnan(value) else float(value)
-
-
-def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:
-    """Columns about faults since an earlier count, and the present number of workers."""
-    return {
-        "retries": now.retries - since.retries,
-        "lost_workers": now.lost_workers - since.lost_workers,
-        "workers": now.workers,
-    }
 
 
 def norm(x_D: FloatArray) -> float:

@@ -4,7 +4,7 @@ worker has; and what a sender makes of each subject once, whoever gets it."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from es_service.protocol.kept import Kept
 from es_service.protocol.messages import Subject
@@ -23,25 +23,19 @@ def forget_old_subjects(kept: Kept[Any, Any]) -> None:
     kept.forget_oldest(KEPT_BYTES, KEPT_SUBJECTS, spared=[*kept][-1:])
 
 
-class MadeOnce(Generic[Made]):
-    """What a sender makes of subjects, such as messages. One that was forgotten meanwhile is made again."""
+class MadeOnce(Kept[int, tuple[Subject, Made]]):
+    """What a sender makes of subjects, such as messages. One that was forgotten meanwhile is made again.
+
+    The key is the subject's `id`, which the subject in the entry keeps from being reused.
+    """
 
     def __init__(self, make: Callable[[Subject], Made]) -> None:
+        super().__init__(lambda entry: entry[0].nbytes)
         self._make = make
-        self._made: Kept[int, tuple[Subject, Made]] = Kept(lambda entry: entry[0].nbytes)
-        """By `id`, which the subject in the entry keeps from being reused."""
 
     def of(self, subject: Subject) -> Made:
         """What was or is made of a subject."""
-        if (known := self._made.get(id(subject))) is None:
+        if (known := self.get(id(subject))) is None:
             known = subject, self._make(subject)
-            self._made.add(id(subject), known)
+            self.add(id(subject), known)
         return known[1]
-
-    def forget_old(self) -> None:
-        """Forget as `forget_old_subjects`."""
-        forget_old_subjects(self._made)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._made.clear()

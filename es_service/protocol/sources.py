@@ -41,12 +41,7 @@ SHARED_FOLDERS = ("site-packages", "dist-packages")
 
 
 def task_code(environment: str, descriptor: object) -> tuple[str, ...]:
-    """What a task's config says that may name code of a user: the task, and a descriptor that is `module:function`.
-
-    Args:
-        environment: the value of `task.environment`.
-        descriptor: the value of `task.descriptor`.
-    """
+    """What a task's config says that may name code of a user: the task, and a descriptor that is `module:function`."""
     return (environment, descriptor) if isinstance(descriptor, str) and ":" in descriptor else (environment,)
 
 
@@ -64,11 +59,7 @@ def worker_sources(*names: str) -> dict[str, str]:
 
 def driver_sources(algorithm: str) -> dict[str, str]:
     """Sources with which the driver computes besides those of the workers. Those of a user's search are read anew,
-    because each run imports what has changed of them (`user_code.import_user_module`).
-
-    Args:
-        algorithm: the value of `search.algorithm`.
-    """
+    because each run imports what has changed of them (`user_code.import_user_module`)."""
     return _package_sources(*DRIVER) | user_sources(algorithm)
 
 

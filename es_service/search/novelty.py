@@ -78,11 +78,7 @@ class NoveltyArchive:
 
 
 def empty_archive(dimensions: int) -> NoveltyArchive:
-    """A novelty archive without entries, in which every novelty is 0.
-
-    Args:
-        dimensions: number of descriptor dimensions.
-    """
+    """A novelty archive without entries, in which every novelty is 0."""
     return NoveltyArchive(np.zeros((0, dimensions)), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 

@@ -62,13 +62,7 @@ def utilities(
     if weight > 0.0:
         utility_P_S += weight * shaped(shaping, values(objective, results))
     if weight < 1.0:
-        novelty_P_S = novelty(
-            archive,
-            results.descriptor,
-            neighbours=settings.neighbours,
-            distance=settings.distance,
-            newest=settings.newest,
-        )
+        novelty_P_S = novelty(archive, results.descriptor, **dict(settings))
         novelty_P_S[np.isnan(results.fitness)] = np.nan
         utility_P_S += (1.0 - weight) * shaped(shaping, novelty_P_S)
     return utility_P_S

@@ -15,11 +15,7 @@ STD_FLOOR = 0.1
 
 
 def no_observations(size: int) -> Moments:
-    """Statistics of no observations, as before the first generation.
-
-    Args:
-        size: length of an observation.
-    """
+    """Statistics of no observations of this size, as before the first generation."""
     return Moments(0.0, np.zeros(size), np.zeros(size))
 
 

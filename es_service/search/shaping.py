@@ -134,8 +134,5 @@ def pair_weights(utility_P_S: NDArray[np.float64]) -> NDArray[np.float32]:
     """Weight of each pair's noise, [P]: the utility of the member with sign + minus that of the member with sign -.
 
     Swapping the signs of all pairs negates every weight exactly, and therefore the gradient estimate.
-
-    Args:
-        utility_P_S: utilities with axes P (pairs) and S (signs [+, -]).
     """
     return (utility_P_S[:, 0] - utility_P_S[:, 1]).astype(np.float32)

@@ -156,12 +156,7 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
     entry_M = np.array([centre.entry for centre in state.centres])
     known_M = np.flatnonzero(entry_M != NO_ENTRY)
     novelty_M[known_M] = novelty(
-        state.archive,
-        state.archive.descriptor_N_B[entry_M[known_M]],
-        neighbours=settings.neighbours,
-        distance=settings.distance,
-        newest=settings.newest,
-        exclude_Q=entry_M[known_M],
+        state.archive, state.archive.descriptor_N_B[entry_M[known_M]], **dict(settings), exclude_Q=entry_M[known_M]
     )
     return novelty_M
 

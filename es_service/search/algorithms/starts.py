@@ -79,14 +79,7 @@ def drawn_cell(map_: BehaviourMap, share_N: NDArray[np.float64], uniform: float)
 
 def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: NoveltyConfig) -> NDArray[np.float64]:
     """Novelty of each elite's descriptor in the novelty archive without the elite's own entry, [N]."""
-    return novelty(
-        archive,
-        map_.descriptor_N_B,
-        neighbours=settings.neighbours,
-        distance=settings.distance,
-        newest=settings.newest,
-        exclude_Q=_entries_of_elites(map_, archive),
-    )
+    return novelty(archive, map_.descriptor_N_B, **dict(settings), exclude_Q=_entries_of_elites(map_, archive))
 
 
 def _entries_of_elites(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
