@@ -31,7 +31,7 @@ from es_service.config.methods import (
 )
 from es_service.config.model import RunConfig
 from es_service.config.objective_rules import objective_problems
-from es_service.config.options import TaskTable, options_of, read_options, settings_of_task
+from es_service.config.options import options_of, read_options, settings_of_task
 from es_service.config.problems import nearest, not_allowed, one_of, problem_of, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
@@ -47,6 +47,7 @@ from es_service.config.resolution import (
 from es_service.config.search import SearchConfig
 from es_service.config.shipped import read_config
 from es_service.config.start import folder_problems
+from es_service.config.tasks import Tasks
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec, with_options
@@ -156,7 +157,7 @@ def _load(
         try:
             if not isinstance(given, str) or not given:
                 selected[key] = None
-            elif isinstance(known, TaskTable):
+            elif isinstance(known, Tasks):
                 selected[key] = known.chosen(given, **settings_of_task(values, wanted))
             else:
                 selected[key] = known[given]

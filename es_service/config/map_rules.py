@@ -18,7 +18,7 @@ CVT_CELLS = 1024
 MOST_CVT_CELLS = 4096
 """The time to place the centroids grows with the square of their number: about 15 seconds for this many."""
 MOST_GRID_DIMENSIONS = 6
-"""Largest number of descriptor dimensions for which `kind: auto` is a grid."""
+"""Largest number of descriptor dimensions for which `kind: auto` is a grid, else cvt."""
 LARGEST = 1e30
 """Largest absolute value of bounds and offsets, so that their sums and differences stay finite."""
 
@@ -28,11 +28,6 @@ def default_bounds(values: Mapping[str, Any], task: TaskSpec) -> Bounds | None:
     if UNBOUNDED in task.descriptor_bounds and values.get("map.enabled", True):
         return None
     return tuple((-1.0, 1.0) if pair == UNBOUNDED else pair for pair in task.descriptor_bounds)
-
-
-def default_kind(dimensions: int) -> str:
-    """Kind of map for a descriptor: grid for up to six dimensions, else cvt."""
-    return "grid" if dimensions <= MOST_GRID_DIMENSIONS else "cvt"
 
 
 def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:

@@ -123,15 +123,10 @@ def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: A
     return problem_of(key, value, what, suggestion=default)
 
 
-def default_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int:
-    """Number of centres for `search.centres: auto`."""
-    return _only_centres(values, settings) or settings.first_centres
-
-
 def method_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> list[Problem]:
     """Problems of settings that the method does not support."""
     method, problems = values["search.algorithm"], []
-    centres, only = values.get("search.centres"), _only_centres(values, settings)
+    centres, only = values.get("search.centres"), only_centres(values, settings)
     if only is not None and centres not in (None, only):
         each = "" if isinstance(settings.only_centres, int) else f" for each of {settings.only_centres}"
         why = f" for {method}, which has one centre{each}"
@@ -152,7 +147,7 @@ def start_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> l
     return [not_allowed("search.init_from", values.get("search.init_from"), "the folder of a run", why=why)]
 
 
-def _only_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int | None:
+def only_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int | None:
     """The only number of centres that a method supports; None if it supports any, or if its key has no valid value."""
     only = settings.only_centres
     return values.get(only, search_fields(settings)[only].default) if isinstance(only, str) else only

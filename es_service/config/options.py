@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,21 +9,12 @@ from es_service.config.fields import TASK_OPTIONS
 from es_service.config.problems import nearest, one_of, problem_of, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
-from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, OptionValue, allowed_text, allowed_value
 
 
-class TaskTable(Mapping[str, TaskSpec]):
-    """Tasks by name, of which some are described only with what a config chooses for them."""
-
-    @abstractmethod
-    def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
-        """The task with options and a descriptor; raises what a lookup raises. Most tasks do not depend on them."""
-        raise NotImplementedError
-
-
 def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """What a config chooses for its task besides its name, as arguments of `TaskTable.chosen`.
+    """What a config chooses for its task besides its name, as arguments of `Tasks.chosen`.
 
     Values of types that no task takes are left out; they are reported elsewhere.
 

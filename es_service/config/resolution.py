@@ -15,8 +15,8 @@ from typing import Any
 from es_service.config.caller import CALLER
 from es_service.config.fields import RESOURCES, TASK_OPTIONS
 from es_service.config.keys import FIELDS, policy_of
-from es_service.config.map_rules import default_bounds, default_cells, default_kind, default_qd_offset
-from es_service.config.methods import default_centres
+from es_service.config.map_rules import MOST_GRID_DIMENSIONS, default_bounds, default_cells, default_qd_offset
+from es_service.config.methods import only_centres
 from es_service.config.model import RunConfig, policy_spec
 from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, one_of, problem_of, wrong_value
@@ -128,7 +128,7 @@ def resolve(
             values["task.episode_steps"] = task.episode_steps
         chosen = with_options(task, options_of(values))
         if "map.kind" in left_open:
-            values["map.kind"] = default_kind(len(chosen.descriptor_names))
+            values["map.kind"] = "grid" if len(chosen.descriptor_names) <= MOST_GRID_DIMENSIONS else "cvt"
         kind = values.get("map.kind")
         if "map.bounds" in left_open:
             values["map.bounds"] = default_bounds(values, chosen)
@@ -137,13 +137,14 @@ def resolve(
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.centres" in left_open and settings is not None:
-        values["search.centres"] = default_centres(values, settings)
+        values["search.centres"] = only_centres(values, settings) or settings.first_centres
     if "compute.engine" in left_open:
         has_actor_cores = _value(values, f"{RESOURCES}cpu") not in ("auto", 1)
         for_ray = _value(values, "compute.address") is not None or has_actor_cores
         values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
-        shape, gpu, here = _policy_spec(values, task), _on_gpu(values), _is_here(values)
+        # In a cluster it does not matter what this machine can run.
+        shape, gpu, here = _policy_spec(values, task), _on_gpu(values), values.get("compute.address") is None
         values["compute.rollout"] = choose(rollouts, task, shape, gpu=gpu, here=here)
     has_pairs = settings is None or issubclass(settings, PopulationConfig)
     pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
@@ -298,11 +299,6 @@ def _on_gpu(values: Mapping[str, Any]) -> bool:
 def _value(values: Mapping[str, Any], key: str) -> Any:
     """The value in the config, or the field's default."""
     return values.get(key, FIELDS[key].default)
-
-
-def _is_here(values: Mapping[str, Any]) -> bool:
-    """Whether the workers run on this machine; in a cluster it does not matter what this machine can run."""
-    return values.get("compute.address") is None
 
 
 def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts: Rollouts) -> list[Problem]:

@@ -16,7 +16,6 @@ from typing import Any
 
 from es_service.config.caller import CALLER, caller_task
 from es_service.config.model import RunConfig
-from es_service.config.options import TaskTable
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
@@ -32,7 +31,7 @@ DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
 
 
-class Tasks(TaskTable):
+class Tasks(Mapping[str, TaskSpec]):
     """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `gymnasium:ID`,
     `module:Class`, `python:module:Class` and `function:module:name`."""
 
@@ -41,7 +40,7 @@ class Tasks(TaskTable):
         return self.chosen(name, {}, None)
 
     def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
-        """Raises as a lookup."""
+        """The task with options and a descriptor, on which most tasks do not depend. Raises as a lookup."""
         if name == CALLER:
             return caller_task(options)
         if ":" not in name:

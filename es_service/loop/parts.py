@@ -247,21 +247,10 @@ def elite_from_arrays(arrays: Mapping[str, np.ndarray]) -> Elite:
 
 def best_to_arrays(best: Best) -> Arrays:
     """Arrays of the best centre so far."""
-    return {
-        "generation": np.asarray(best.generation, np.int64),
-        "fitness": np.asarray(best.fitness, np.float64),
-        "centre_D": best.centre_D,
-        "observation_mean_O": best.observation_mean_O,
-        "observation_std_O": best.observation_std_O,
-    }
+    return {name: np.asarray(value) for name, value in vars(best).items()}
 
 
 def best_from_arrays(arrays: Mapping[str, np.ndarray]) -> Best:
     """Inverse of `best_to_arrays`."""
-    return Best(
-        generation=int(arrays["generation"]),
-        fitness=float(arrays["fitness"]),
-        centre_D=arrays["centre_D"],
-        observation_mean_O=arrays["observation_mean_O"],
-        observation_std_O=arrays["observation_std_O"],
-    )
+    policy = (arrays[name] for name in ("centre_D", "observation_mean_O", "observation_std_O"))
+    return Best(int(arrays["generation"]), float(arrays["fitness"]), *policy)

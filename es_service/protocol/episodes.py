@@ -1,4 +1,4 @@
-"""Results of episodes array by array: changed, joined, and those of one of several policies."""
+"""Results of episodes array by array: changed, joined, and those of some of several policies."""
 
 from __future__ import annotations
 
@@ -39,10 +39,12 @@ def joined(results: Sequence[EpisodesResult], count: int | None = None, *, trace
     )
 
 
-def one_of(results: EpisodesResult, index: int) -> EpisodesResult:
-    """The results at an index of the first axis, such as those of one policy [E] from those of all [N, E]."""
-    part = replace(each(lambda array: array[index], results), failures=())  # they do not name their index
+def part_of(results: EpisodesResult, of: int | slice) -> EpisodesResult:
+    """The results at an index of the first axis, such as those of one policy [E] from those of all [N, E], or in a
+    slice of it that names its start."""
+    part = replace(each(lambda array: array[of], results), failures=())  # they do not name their index
     if not results.of_steps:
         return part
-    first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[index]))
+    index = of.start if isinstance(of, slice) else of
+    first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[of]))
     return replace(part, of_steps={name: array[first : first + rows] for name, array in results.of_steps.items()})

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from es_service.protocol.episodes import each, joined
+from es_service.protocol.episodes import joined, part_of
 from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
@@ -122,22 +122,17 @@ def separated(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[Chun
         return list(results)
     chunk_results: list[ChunkResult] = []
     for result in results:
+        if not isinstance(result, EpisodesResult):
+            chunk_results.append(result)
+            continue
         ends = [0]
-        while isinstance(result, EpisodesResult) and ends[-1] < len(result.fitness):
+        while ends[-1] < len(result.fitness):
             subject, chunk = work[len(chunk_results) + len(ends) - 1]
             assert isinstance(subject, Policies)
             assert isinstance(chunk, PolicyChunk)
             ends.append(ends[-1] + len(slots(subject, chunk)[0]))
-        chunk_results += (
-            [_rows(result, *place) for place in pairwise(ends)] if isinstance(result, EpisodesResult) else [result]
-        )
+        chunk_results += [
+            replace(part_of(result, slice(first, end)), failures=() if first else result.failures)
+            for first, end in pairwise(ends)  # the first have the failures of all
+        ]
     return chunk_results
-
-
-def _rows(result: EpisodesResult, first: int, end: int) -> EpisodesResult:
-    """The results of some slots; the first have the failures of all."""
-    part = replace(each(lambda array: array[first:end], result), failures=() if first else result.failures)
-    if not result.of_steps:
-        return part
-    start, stop = (int(result.steps[:at].sum(dtype=np.int64)) for at in (first, end))
-    return replace(part, of_steps={name: array[start:stop] for name, array in result.of_steps.items()})

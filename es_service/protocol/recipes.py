@@ -119,7 +119,7 @@ class Recipes:
     def problem(self, parameters: int) -> str:
         """In which way these are no recipes of finite policies with some number of parameters; empty if they are."""
         count = len(self.parent_N_2)
-        facts = _facts_of(self.parents)
+        facts = [*map(_facts, self.parents)]
         for form in dict.fromkeys(parent_facts.form for parent_facts in facts):
             if form != f"float32 ({parameters},)":
                 return f"have a parent that is {form}; must be float32 ({parameters},)"
@@ -201,7 +201,7 @@ def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray
     Raises:
         TypeError: a parent is no array.
     """
-    return Recipes(rule, tuple(facts.name for facts in _facts_of(parents)), tuple(parents), parent_N_2, key_N_4)
+    return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
 
 
 def unvaried(policies: Sequence[FloatArray]) -> Recipes:
@@ -232,15 +232,6 @@ class _Facts(NamedTuple):
 
 _KNOWN: dict[int, _Facts] = {}
 """Facts by the `id` of a read-only array, as long as it lives: the same elites are parents again and again."""
-
-
-def _facts_of(parents: Sequence[FloatArray]) -> list[_Facts]:
-    """The facts of arrays, most of which are known."""
-    known = [_KNOWN.get(id(parent)) for parent in parents]
-    return [
-        facts if facts is not None and facts.of() is parent else _facts(parent)
-        for parent, facts in zip(parents, known, strict=True)
-    ]
 
 
 def _facts(parameters_D: FloatArray) -> _Facts:

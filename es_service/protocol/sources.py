@@ -16,6 +16,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -70,17 +71,9 @@ def user_sources(*names: str) -> dict[str, str]:
         if own := user_path(name):
             sources |= {module.source: module.sha256 for module in modules_of(own).user.values()}
         if name.startswith(f"{LIBRARY}:"):
-            sources |= _version(LIBRARY)
+            with suppress(metadata.PackageNotFoundError):  # its version, in the place of the hash of its files
+                sources[LIBRARY] = metadata.version(LIBRARY)
     return sources
-
-
-def _version(package: str) -> dict[str, str]:
-    """The version of a package whose environments are a task, in the place of the hash of its files; empty if it is
-    not installed."""
-    try:
-        return {package: metadata.version(package)}
-    except metadata.PackageNotFoundError:
-        return {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -133,11 +126,6 @@ def user_path(name: str) -> str:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")
         return f"{module}:{environment}" if separator else ""
     return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
-
-
-def is_user_code(name: str) -> bool:
-    """Whether a task, a descriptor or an algorithm is the user's."""
-    return bool(user_path(name))
 
 
 @cache

@@ -14,7 +14,7 @@ import numpy as np
 
 from es_service.errors import ServiceError
 from es_service.protocol.recordings import Recordings
-from es_service.protocol.sources import is_user_code, task_code
+from es_service.protocol.sources import task_code, user_path
 from es_service.report import floor
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -47,7 +47,7 @@ def replay_section(
         run.policy("certified")
     task, search = run.present_config["task"], run.present_config["search"]
     names = (*task_code(task["environment"], task.get("descriptor")), search["algorithm"])
-    if not trusted and (code := [name for name in names if is_user_code(name)]):
+    if not trusted and (code := [name for name in names if user_path(name)]):
         return _no_replay(
             f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "
             "author, ask for the replay by its name: best, certified, or a cell."

@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.loop.generation import steps_of
 from es_service.loop.policies import policy_episodes, policy_work
-from es_service.protocol.episodes import one_of
+from es_service.protocol.episodes import part_of
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, FloatArray, Work
 from es_service.protocol.noise import Domain
@@ -113,7 +113,7 @@ def new_episodes(
     work: list[Work] = [subject_chunk for each in asked for subject_chunk in each.work]
     answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
     results = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
-    return [one_of(result, 0) for result in results]
+    return [part_of(result, 0) for result in results]
 
 
 def kept(result: EpisodesResult) -> Episodes:

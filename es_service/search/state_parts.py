@@ -74,7 +74,10 @@ def read_only(extra: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(extra, ReadOnly):
         return extra
     # A resumed run has arrays in C order; in another one, sums of the same values may have other bits.
-    ordered = {name: np.array(value, order="C") if _is_disordered(value) else value for name, value in extra.items()}
+    ordered = {
+        name: np.array(value, order="C") if isinstance(value, np.ndarray) and not value.flags.c_contiguous else value
+        for name, value in extra.items()
+    }
     freeze(ordered.values())
     return ReadOnly(ordered)
 
@@ -261,10 +264,6 @@ def _same_first(now: Arrays, then: Arrays) -> int:
 
 def _is_array(value: object) -> bool:
     return isinstance(value, np.ndarray | np.generic) and value.dtype.kind in _NUMERIC_KINDS
-
-
-def _is_disordered(value: object) -> bool:
-    return isinstance(value, np.ndarray) and not value.flags.c_contiguous
 
 
 def _kind(value: object) -> str:

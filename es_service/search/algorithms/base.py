@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.parts import Objective
-from es_service.protocol.episodes import one_of
+from es_service.protocol.episodes import part_of
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray
 from es_service.protocol.recipes import Recipes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -217,7 +217,7 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
             self.descriptor_N_B[index],
             float(self.population_max_N[index]),
             self.episodes,
-            None if self.results is None else one_of(self.results, index),
+            None if self.results is None else part_of(self.results, index),
         )
 
 
