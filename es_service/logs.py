@@ -20,21 +20,16 @@ _generation: ContextVar[int | str] = ContextVar("generation", default="-")
 logging.getLogger("es_service").addHandler(logging.NullHandler())  # else Python prints warnings that nobody asked for
 
 
-class _Context(logging.Filter):
-    """Adds `run` and `generation` to a record; keeps every record."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        record.run, record.generation = _run.get(), _generation.get()
-        return True
-
-
-_CONTEXT = _Context()
+def _in_context(record: logging.LogRecord) -> bool:
+    """Add `run` and `generation` to a record, and keep every record."""
+    record.run, record.generation = _run.get(), _generation.get()
+    return True
 
 
 def logger(name: str) -> logging.Logger:
     """The logger of a module of es_service, `logger(__name__)`."""
     module_logger = logging.getLogger(name)
-    module_logger.addFilter(_CONTEXT)
+    module_logger.addFilter(_in_context)
     return module_logger
 
 

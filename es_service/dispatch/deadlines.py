@@ -54,11 +54,6 @@ def note_compiled(s: SchedulerState, event: Compiled, now: float) -> None:
     put_worker(s, group, event.worker, record)
 
 
-def add_duration(s: SchedulerState, kind: str, chunk_s: float) -> None:
-    """Remember how long a chunk of a kind took, in seconds, and forget the oldest duration if there are many."""
-    s.durations_s[kind] = (*s.durations_s.get(kind, ()), chunk_s)[-RECENT_DURATIONS:]
-
-
 def missed_deadline(s: SchedulerState, worker: int) -> str:
     """Text that says what a worker has not done in time."""
     record = s.up.get(worker) or s.draining.get(worker)

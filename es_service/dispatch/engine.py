@@ -268,13 +268,11 @@ class Engine(Generic[AnyTransport]):
             count, chunk_s = len(list(chunks)), usual_chunk_s(state, kind)
             for size in item_sizes(count, workers, chunk_s, limits.item_s, limits.cores):
                 part = work[first : first + size]
-                parts.append((self._item_id(first, kind, part), part))
+                chunk = part[0][1]
+                item_id = WorkItemId(self._phase, first, kind, chunk.generation, chunk.ask, chunk.chunk_id, len(part))
+                parts.append((item_id, part))
                 first += size
         return parts
-
-    def _item_id(self, first: int, kind: str, part: Sequence[Work]) -> WorkItemId:
-        chunk = part[0][1]
-        return WorkItemId(self._phase, first, kind, chunk.generation, chunk.ask, chunk.chunk_id, len(part))
 
     def _serve(self) -> None:
         """Handle the next message, or check the deadlines if none arrives for a short time."""
@@ -323,16 +321,12 @@ class Engine(Generic[AnyTransport]):
     def _more(self, event: events.Event) -> str:
         """What the error that ends the run says of the work item that was lost too often with `event`."""
         most = self._state.limits.max_attempts
-        lost = [work for item, work in self._work.items() if self._faults(item) >= most]
+        items = self._state.items
+        lost = [work for item, work in self._work.items() if item in items and items[item].faults >= most]
         if isinstance(event, events.Failure) or not lost:
             return ""
         text = self.describe(lost[0])
         return f"\n{text}" if text else ""
-
-    def _faults(self, item_id: Hashable) -> int:
-        """Number of times that a work item was charged with a fault."""
-        waiting = self._state.items.get(item_id)
-        return 0 if waiting is None else waiting.faults
 
     def _tell(self, entry: events.Event | events.Command) -> None:
         """Write an event or a command to the dispatch log and to `logging`, there also a traceback at level DEBUG."""

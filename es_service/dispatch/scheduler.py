@@ -34,7 +34,7 @@ import math
 from collections.abc import Hashable
 
 from es_service.dispatch.assignment import assign
-from es_service.dispatch.deadlines import add_duration, begin_first_slot, missed_deadline, note_compiled, plain
+from es_service.dispatch.deadlines import RECENT_DURATIONS, begin_first_slot, missed_deadline, note_compiled, plain
 from es_service.dispatch.events import (
     Command,
     Compiled,
@@ -147,7 +147,8 @@ def _result(s: SchedulerState, out: list[Command], worker: int, item_id: Hashabl
         if index == 0 and delivered:
             pace = IN_TIME if record.late_s > -math.inf else LATE
             if item.kind in record.warm:  # else it may include compiling
-                add_duration(s, item.kind, (now - record.started_s) / item.size)
+                chunk_s = (now - record.started_s) / item.size
+                s.durations_s[item.kind] = (*s.durations_s.get(item.kind, ()), chunk_s)[-RECENT_DURATIONS:]
         record = record._replace(slots=without(record.slots, index), pace=pace, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
 

@@ -89,12 +89,8 @@ def archive_changes(archive: NoveltyArchive, before: NoveltyArchive | None) -> d
     same = same_entries(archive, before)
     if same == archive.size == before.size:
         return {}
-    gone = range(_blocks(archive), _blocks(before))
+    gone = range(-(-archive.size // BLOCK_ENTRIES), -(-before.size // BLOCK_ENTRIES))
     return {**archive_to_parts(archive, same), **dict.fromkeys(map(block_part, gone))}
-
-
-def _blocks(archive: NoveltyArchive) -> int:
-    return -(-archive.size // BLOCK_ENTRIES)
 
 
 def map_changes(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays | None]:

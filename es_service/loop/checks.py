@@ -150,19 +150,14 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
     }
     wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
     steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
-    if told := [text for evaluation in evaluations for text in evaluation.failures]:
-        raise EvaluationError(
-            f"generation 0: each of the {count} episodes of the initial centres failed. The first: {told[0]}",
-            field="task.environment",
-            value=environment,
-        )
-    raise EvaluationError(
-        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the "
-        f"shortest episode has {steps} steps. The run cannot learn from this: look for a division by 0, a root or "
-        f"logarithm of a negative number, or physics that diverges, in the task {environment}",
-        field="task.environment",
-        value=environment,
+    why = (
+        f"the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the shortest episode "
+        f"has {steps} steps. The run cannot learn from this: look for a division by 0, a root or logarithm of a "
+        f"negative number, or physics that diverges, in the task {environment}"
     )
+    if told := [text for evaluation in evaluations for text in evaluation.failures]:
+        why = f"each of the {count} episodes of the initial centres failed. The first: {told[0]}"
+    raise EvaluationError(f"generation 0: {why}", field="task.environment", value=environment)
 
 
 def require_finite(centres: Sequence[Centre], search: SearchConfig, generation: int) -> None:

@@ -116,16 +116,12 @@ def run(
             state = finished[0].state
         record()
     except _Stopped as stopped:
-        reason = stopped.reason
+        reason = stopped.args[0]
     return state, reason
 
 
 class _Stopped(Exception):  # noqa: N818 (ends the loop)
-    """`report` has returned a `Stop`."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """`report` has returned a `Stop`, whose reason is the argument."""
 
 
 def stored_state(store: Stored, task: TaskSpec) -> RunState | None:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from es_service.config.model import RunConfig
 from es_service.loop.checks import valid_members
 from es_service.loop.generation import first_episode, highest, steps_of
-from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, norm, with_gaps
+from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, with_gaps
 from es_service.loop.policies import PolicyWork, no_statistics, policy_work
 from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.maps.behaviour_map import EMPTY
+from es_service.search.steps.clipup import norm
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from es_service.loop.history import (
     HistoryRow,
     Table,
     evaluation_columns,
-    norm,
     or_none,
     population_columns,
 )
@@ -26,6 +25,7 @@ from es_service.loop.parts import Changes
 from es_service.loop.state import RunState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.observation_statistics import merge_moments
+from es_service.search.steps.clipup import norm
 
 Reachable = NDArray[np.bool_] | None
 """Whether each cell of the map can be reached, [cells]; None if this is unknown."""

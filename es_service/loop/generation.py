@@ -50,6 +50,7 @@ from es_service.search.algorithms.base import (
 from es_service.search.algorithms.common import first_state
 from es_service.search.maps.behaviour_map import EMPTY, Elite, empty_map, make_elite
 from es_service.search.maps.geometry import make_geometry
+from es_service.search.steps.clipup import norm
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
 
@@ -197,11 +198,8 @@ def halves(
 
 
 def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
-    first, second, both = (
-        float(np.sum(np.multiply(left_D, right_D, dtype=np.float64)))
-        for left_D, right_D in ((first_D, first_D), (second_D, second_D), (first_D, second_D))
-    )
-    length = math.sqrt(first) * math.sqrt(second)
+    length = norm(first_D) * norm(second_D)
+    both = float(np.sum(np.multiply(first_D, second_D, dtype=np.float64)))
     return max(0.0, both / length) if length > 0.0 else 0.0
 
 

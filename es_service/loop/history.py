@@ -277,8 +277,3 @@ def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArra
 def or_none(value: float) -> float | None:
     """A number, or None for NaN."""
     return None if math.isnan(value) else float(value)
-
-
-def norm(x_D: FloatArray) -> float:
-    """Euclidean norm."""
-    return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))

@@ -95,7 +95,7 @@ def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
 
 def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
     """Whether the policies of a chunk are the next ones after those of a group."""
-    (subject, chunk), (before, last) = work, group[-1]
+    (subject, chunk), (before, last), (beginning, _) = work, group[-1], group[0]
     recipes, earlier = recipes_in(subject), recipes_in(before)
     return (
         recipes is not None
@@ -103,17 +103,14 @@ def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
         and recipes.names is earlier.names  # those of one ask
         and isinstance(subject, Policies)
         and isinstance(before, Policies)
-        and subject.first + len(recipes) - _first(group[0][0]) <= most
+        and isinstance(beginning, Policies)
+        and subject.first + len(recipes) - beginning.first <= most
         and subject.episodes == 1
         and subject.observation_mean_N_O is before.observation_mean_N_O is None
         and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
         and chunk == replace(last, chunk_id=last.chunk_id + 1)
         and chunk == PolicyChunk(chunk.generation, chunk.chunk_id, chunk.ask)
     )
-
-
-def _first(subject: Subject) -> int:
-    return subject.first if isinstance(subject, Policies) else 0
 
 
 def separated(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[ChunkResult]:

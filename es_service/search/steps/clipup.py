@@ -38,14 +38,14 @@ def clipup_step(
     with np.errstate(over="ignore", invalid="ignore"):  # the driver refuses a centre that is not finite
         ascent_D = gradient_D - centre_D * np.float32(settings.l2)
         velocity_D = state["velocity_D"] * np.float32(settings.momentum)
-        if length := _norm(ascent_D):
+        if length := norm(ascent_D):
             velocity_D = velocity_D + ascent_D * np.float32(settings.learning_rate / length)
         fastest = settings.max_speed or SPEED * settings.learning_rate
-        if (speed := _norm(velocity_D)) > fastest:
+        if (speed := norm(velocity_D)) > fastest:
             velocity_D = velocity_D * np.float32(fastest / speed)
         return {"velocity_D": velocity_D}, np.asarray(centre_D + velocity_D, np.float32)
 
 
-def _norm(x_D: np.ndarray) -> float:
+def norm(x_D: np.ndarray) -> float:
     """Euclidean norm; a sum of squares in float64, so that no library for matrices decides about its bits."""
     return math.sqrt(float(np.sum(np.square(x_D, dtype=np.float64))))
