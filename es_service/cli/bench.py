@@ -15,11 +15,6 @@ from es_service.errors import ConfigError
 bench = typer.Typer(help="Measure the speed of this machine.", no_args_is_help=True)
 
 
-@bench.callback()
-def _bench() -> None:
-    """Do nothing; this callback keeps the commands subcommands."""
-
-
 @bench.command()
 def rollouts(
     task: Annotated[

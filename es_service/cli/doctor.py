@@ -8,7 +8,7 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +20,7 @@ from es_service.cli.data import print_json
 from es_service.cli.options import print_finding
 from es_service.config.model import worker_spec
 from es_service.config.tasks import TASKS
-from es_service.dispatch.cluster_findings import Finding, cluster_findings
+from es_service.dispatch.cluster_findings import Finding
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -42,18 +42,13 @@ SIGMA = 0.02
 """Standard deviation of the noise with which the speed is measured; it makes no difference."""
 
 
-def examine(*, as_json: bool = False) -> bool:
-    """Print every finding, at once or as JSON at the end, and return whether no check failed."""
-    checks = (_software, _ray, _machine, _vectors, _disk, _noise, _rollout)
-    return print_findings((finding for check in checks for finding in _guarded(check)), as_json=as_json)
+def findings() -> Iterator[Finding]:
+    """What is found on this machine, check by check."""
+    for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
+        yield from _guarded(check)
 
 
-def examine_cluster(address: str, *, as_json: bool = False) -> bool:
-    """The same for a Ray cluster."""
-    return print_findings(iter(cluster_findings(address)), as_json=as_json)
-
-
-def print_findings(findings: Iterator[Finding], *, as_json: bool) -> bool:
+def print_findings(findings: Iterable[Finding], *, as_json: bool) -> bool:
     """Print each finding when it is there, or all as JSON at the end; return whether no check failed."""
     listed: list[Finding] = []
     for level, text in findings:

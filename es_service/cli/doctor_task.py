@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from es_service.cli.doctor import Finding, print_findings
 from es_service.config.problems import did_you_mean, one_of
 from es_service.config.tasks import TASKS
+from es_service.dispatch.cluster_findings import Finding
 from es_service.errors import ConfigError
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
 from es_service.runs.repeating import compared, examined
@@ -15,15 +15,8 @@ SECONDS = 1.0
 """Duration of the measurement."""
 
 
-def examine_task(name: str, *, as_json: bool = False) -> bool:
-    """Print every finding about a task, at once or as JSON at the end, and return whether no check failed.
-
-    Raises ConfigError if there is no such task, or it cannot be used.
-    """
-    return print_findings(_findings(name), as_json=as_json)
-
-
-def _findings(name: str) -> Iterator[Finding]:
+def task_findings(name: str) -> Iterator[Finding]:
+    """What is found about a task. Raises ConfigError if there is no such task, or it cannot be used."""
     try:
         task = TASKS[name]
     except KeyError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
-from es_service.cli.console import console, errors
+from es_service.cli.console import console, errors, print_line
 from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, place_of, print_note
-from es_service.cli.several import RunsArgument, is_single, items_of_each, of_each, readable, started_runs
+from es_service.cli.several import RunsArgument, is_single, items_of_each, of_each, readable
 from es_service.errors import ConfigError
 from es_service.report.progress import print_notice
 
@@ -62,8 +62,10 @@ def evaluate(
     log_level: LogLevelOption = None,
 ) -> None:
     """Evaluate policies of a run, or of several, on fresh episodes; print the results beside the stored values."""
+    from es_service.cli.tables.certified import print_certified
     from es_service.cli.tables.evaluations import csv_file, print_header, print_map_summary, print_row, row_of
     from es_service.runs import evaluation
+    from es_service.runs.certification import certify_run
 
     if every and cell:
         raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
@@ -72,24 +74,18 @@ def evaluate(
         for _, result in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
             if isinstance(result, ConfigError) and result.field == "compute.workers":
                 raise result
-    if certify:
-        for option, value in (("--all", every or None), ("--seed", seed)):
-            if value is not None:
-                raise ConfigError(f"{option} and --certify cannot be combined; leave one of them out")
-        anything = best or centre or cells or top is not None
-        which = {"best": best or not anything, "centre": centre, "cells": cells}
-        which |= {"top": (top or 0) if anything else None, "generation": generation}
-        given = {"episodes": episodes, "keep": keep, "by": by, "workers": workers}
-        asked = which | {name: value for name, value in given.items() if value is not None}
-        _certify(folders, out, asked, as_json=as_json)
-        return
-    for option, value in (("--keep", keep), ("--by", by)):
+    alone = {"--all": every or None, "--seed": seed} if certify else {"--keep": keep, "--by": by}
+    for option, value in alone.items():
+        if value is not None and certify:
+            raise ConfigError(f"{option} and --certify cannot be combined; leave one of them out")
         if value is not None:
             raise ConfigError(f"{option} {value} needs --certify; add it, or leave {option} out")
     single = is_single(folders)
-    width = None if single else max(map(len, map(str, started_runs(folders))), default=0)
+    begun = of_each(folders, lambda run: run)
+    width = None if single else max((len(str(run)) for run, result in begun if result is not None), default=0)
+    tell = partial(print_notice, errors)
 
-    def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
+    def fresh_rows(folder: Path) -> Iterator[dict[str, Any]]:
         run = api.open_run(folder)
         best_too = best or not (centre or cell or every or top)
         chosen = evaluation.candidates(
@@ -98,7 +94,6 @@ def evaluate(
         if single and not as_json:
             print_header(console)
         results = []
-        tell = partial(print_notice, errors)
         for fresh in evaluation.evaluate(run, chosen, episodes or 100, workers, seed or 0, on_compile=tell):
             results.append(fresh)
             row = row_of(fresh, run.descriptor_names, None if single else folder)
@@ -108,33 +103,32 @@ def evaluate(
         if every and not as_json:
             print_map_summary(console, run, results)
 
+    def certified_rows(folder: Path) -> Iterator[dict[str, Any]]:
+        anything = best or centre or cells or top is not None
+        given: dict[str, Any] = {"episodes": episodes, "keep": keep, "by": by}
+        certified = certify_run(
+            folder, best=best or not anything, centre=centre, cells=cells, top=(top or 0) if anything else None,
+            generation=generation, workers=workers, on_notice=tell,
+            **{name: value for name, value in given.items() if value is not None},
+        )  # fmt: skip
+        if not as_json:
+            print_line(console, f"{folder}: certification {certified[0].number}")
+            print_certified(console, certified)
+        for policy in certified:
+            yield ({} if single else {"run": str(folder)}) | policy.row()
+
+    rows_of = certified_rows if certify else fresh_rows
     rows: list[dict[str, Any]] = []
     problems: list[dict[str, str]] = []
     with csv_file(out, print_note) as write:
         if single:
             evaluated_rows = rows_of(folders[0])
         else:
-            if not as_json:
+            if not as_json and not certify:
                 print_header(console, width)
             evaluated_rows = (row for _, row in readable(items_of_each(folders, rows_of), problems))
         for row in evaluated_rows:
             rows.append(row)
-            write(row)
-    if as_json:
-        print_json([*rows, *problems])
-    if problems:
-        raise typer.Exit(1)
-
-
-def _certify(folders: list[Path], out: Path | None, asked: Mapping[str, Any], *, as_json: bool) -> None:
-    """Certify policies; `asked` are arguments of `certify_run`."""
-    from es_service.cli.certify import certified_rows
-    from es_service.cli.tables.evaluations import csv_file
-
-    problems: list[dict[str, str]] = []
-    with csv_file(out, print_note) as write:
-        rows = certified_rows(folders, problems, as_json=as_json, **asked)
-        for row in rows:
             write(row)
     if as_json:
         print_json([*rows, *problems])

@@ -176,15 +176,17 @@ def doctor(
     as_json: JsonOption = False,
 ) -> None:
     """Check that this machine, a cluster or a task can run searches, and show what their results depend on."""
-    from es_service.cli.doctor import examine, examine_cluster
-    from es_service.cli.doctor_task import examine_task
+    from es_service.cli.doctor import findings, print_findings
+    from es_service.cli.doctor_task import task_findings
+    from es_service.dispatch.cluster_findings import cluster_findings
 
-    if task is not None:
-        if cluster is not None:
-            raise ConfigError("--cluster is no check of a task; leave it or the task out")
-        raise typer.Exit(0 if examine_task(task, as_json=as_json) else 1)
-    passed = examine(as_json=as_json) if cluster is None else examine_cluster(cluster, as_json=as_json)
-    raise typer.Exit(0 if passed else 1)
+    if task is None:
+        found = findings() if cluster is None else cluster_findings(cluster)
+    elif cluster is None:
+        found = task_findings(task)
+    else:
+        raise ConfigError("--cluster is no check of a task; leave it or the task out")
+    raise typer.Exit(0 if print_findings(found, as_json=as_json) else 1)
 
 
 def main() -> None:

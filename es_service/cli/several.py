@@ -12,7 +12,7 @@ import typer
 from es_service.cli.commands import error_message
 from es_service.cli.options import print_error, print_note
 from es_service.errors import Interrupted, ServiceError
-from es_service.runs.folders import holds_runs, runs_of
+from es_service.runs.folders import runs_of
 from es_service.store.folder import holds_run
 
 RunsArgument = Annotated[
@@ -23,12 +23,7 @@ T = TypeVar("T")
 
 def is_single(folders: Sequence[Path]) -> bool:
     """Whether the folders of a command are one run; if not, its output names each run."""
-    return len(folders) == 1 and not holds_runs(folders[0])
-
-
-def started_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of the runs that have started, and of those that cannot be found."""
-    return [folder for folder, result in of_each(folders, lambda run: run) if result is not None]
+    return len(folders) == 1 and runs_of(folders[0]) == [folders[0]]
 
 
 def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tuple[Path, T | ServiceError | None]]:

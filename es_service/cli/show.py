@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,33 +74,23 @@ def digest_(
     as_json: JsonOption = False,
 ) -> None:
     """Check all data of a run and print a SHA-256 of everything deterministic in it; of several runs, a line each."""
-    if is_single(folders):
-        part_digests, mixed = digest.checked_parts(folders[0])
-        if as_json:
-            print_json(digest_data(part_digests, mixed=mixed))
-        else:
-            _print_digest(part_digests, "  mixed" if mixed else "", parts=parts)
-        return
+    single = is_single(folders)
 
     def show(folder: Path) -> dict[str, Any]:
         part_digests, mixed = digest.checked_parts(folder)
         if not as_json:
-            _print_digest(part_digests, f"  {folder}{'  mixed' if mixed else ''}", parts=parts)
-        return {"run": str(folder), **digest_data(part_digests, mixed=mixed)}
+            for name, value in part_digests.items() if parts else ():
+                print(f"{value}  {name}")
+            where = "" if single else f"  {folder}"
+            print(f"{digest.digest_of(part_digests)}{where}{'  mixed' if mixed else ''}", flush=True)
+        return ({} if single else {"run": str(folder)}) | digest_data(part_digests, mixed=mixed)
 
     problems: list[dict[str, str]] = []
-    results = [data for _, data in readable(of_each(folders, show), problems)]
+    results = show(folders[0]) if single else [data for _, data in readable(of_each(folders, show), problems)]
     if as_json:
-        print_json([*results, *problems])
+        print_json(results if single else [*results, *problems])
     if problems:
         raise typer.Exit(1)
-
-
-def _print_digest(part_digests: Mapping[str, str], ending: str, *, parts: bool) -> None:
-    if parts:
-        for name, value in part_digests.items():
-            print(f"{value}  {name}")
-    print(f"{digest.digest_of(part_digests)}{ending}", flush=True)
 
 
 def config_(

@@ -9,12 +9,6 @@ from es_service.runs.sweep import INSIDE
 from es_service.store.folder import holds_run, runs_inside
 
 
-def holds_runs(folder: Path) -> bool:
-    """Whether a folder is that of a sweep, or contains the folders of runs, and is no run itself. Raises StoreError as
-    `holds_run`."""
-    return not holds_run(folder) and bool(_inside(folder))
-
-
 def runs_of(folder: Path) -> list[Path]:
     """The folder itself, or the folders of the runs that it holds, also of those that a sweep has not started yet.
 

@@ -6,14 +6,15 @@ import re
 
 import pytest
 
-from es_service.cli.doctor_task import _findings, examine_task
+from es_service.cli.doctor import print_findings
+from es_service.cli.doctor_task import task_findings
 from es_service.errors import ConfigError
 
 MODULE = "tests.workers.host_tasks"
 
 
 def findings(name):
-    return list(_findings(name))
+    return list(task_findings(name))
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ def test_a_task_that_does_not_repeat_is_told_from_one_that_does(monkeypatch, cap
     *_, (level, repeats), _ = findings(f"python:{MODULE}:Forgetful")
     assert level == "note"
     assert "it returns other numbers after another episode, so" in repeats
-    assert not examine_task(f"python:{MODULE}:Fragile", as_json=True)
+    assert not print_findings(task_findings(f"python:{MODULE}:Fragile"), as_json=True)
     assert "the fifth step cannot be done" in capsys.readouterr().out
 
 

@@ -15,7 +15,7 @@ from es_service.cli.main import app
 from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
 from es_service.runs import evaluation
-from es_service.runs.folders import holds_runs, runs_of
+from es_service.runs.folders import runs_of
 from es_service.runs.run_status import newest_runs
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
@@ -67,7 +67,7 @@ def test_what_an_interrupted_creation_left_is_no_run(tmp_path):
     shutil.copytree(run, tmp_path / ".seed=1.creating")
     assert runs_of(tmp_path) == newest_runs(tmp_path) == [run]
     shutil.rmtree(run)
-    assert not holds_runs(tmp_path)
+    assert runs_of(tmp_path) == [tmp_path]
     assert newest_runs(tmp_path) == []
     with pytest.raises(StoreError, match="and no run folders, as a sweep does"):
         es("status", tmp_path)
