@@ -81,7 +81,7 @@ def _compare(
 ) -> None:
     """Write the comparison of all runs with a finished generation; exit with code 1 if a run cannot be read."""
     from es_service.report.compare import swept_keys
-    from es_service.report.write import read_compared, write_compared
+    from es_service.report.write import read_compared, write_comparison
 
     problems: list[dict[str, str]] = []
 
@@ -95,7 +95,7 @@ def _compare(
     runs = list(comparable())
     if len(folders) == 1 and not group_by:
         group_by = swept_keys(runs)
-    for file in write_compared(runs, out, group_by, threshold, figures):
+    for file in write_comparison(runs, out, group_by, threshold, figures):
         print(file)
     if problems:
         raise typer.Exit(1)

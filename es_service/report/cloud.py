@@ -5,7 +5,7 @@ The points are drawn by the page on a canvas, because there may be many; their p
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,20 +20,13 @@ STOPS = 200
 """Most places of the slider."""
 
 
-class Cloud(NamedTuple):
-    """The cloud as markup, and what its script needs."""
+def cloud(data: RunData) -> tuple[Markup, dict[str, Any], tuple[float, float], str] | None:
+    """The cloud of a run; None if no valid centre was evaluated.
 
-    figure: Markup
-    points: dict[str, Any]
-    """`x`, `y` in tenths of a pixel and `level` (index in `colours`) in base64; `stops`: [points shown, text] of each
-    place of the slider."""
-    colours: tuple[float, float]
-    """Fitness of the first and last colour."""
-    explanation: str
-
-
-def cloud(data: RunData) -> Cloud | None:
-    """The cloud of a run; None if no valid centre was evaluated."""
+    Returns:
+        figure; what its script needs: `x`, `y` in tenths of a pixel and `level` (index in `colours`) in base64, and in
+        `stops` [points shown, text] of each place of the slider; fitness of the first and last colour; explanation.
+    """
     names = data.names
     place_N_B = np.stack([data.centres[name] for name in names], axis=1)
     fitness_N, generation_N = data.centres["fitness_mean"], data.centres["generation"]
@@ -79,7 +72,7 @@ def cloud(data: RunData) -> Cloud | None:
     which = "Each point is an evaluated centre, at its mean descriptor"
     more = f"; {len(kept):,} of {valid:,} are shown, at equal distances" if valid > len(kept) else ""
     also = f", in the first two of {len(names)} dimensions" if len(names) > 2 else ""
-    return Cloud(figure, points, colours, f"{which}{also}; the colour is its fitness{more}.")
+    return figure, points, colours, f"{which}{also}; the colour is its fitness{more}."
 
 
 def _best_until(fitness_N: np.ndarray, counts: list[int]) -> list[float]:

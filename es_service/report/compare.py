@@ -168,14 +168,9 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             y_R_K = values_at(group, column, axis, x_K)
             interval = group.interval(y_R_K)
             range_K = None if interval is None else (interval[0], interval[1])
-            lines.append(Line(group.name, column, np.median(y_R_K, axis=0), range_K))
+            lines.append(Line(group.name, np.median(y_R_K, axis=0), range_K))
         chart_list.append(Chart(title, note, tuple(lines), None, percent))
     return chart_list, x_K
-
-
-def quartiles_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
-    """First quartile, median and third quartile over the runs of a group [3, K]; NaN where a run has no value."""
-    return np.quantile(values_at(group, column, axis, x_K), [0.25, 0.5, 0.75], axis=0)
 
 
 def values_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,26 +18,25 @@ STYLES = 7
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 10, 40
 
 
-class Drawn(NamedTuple):
-    """A chart as markup, and what its script needs."""
+def draw_charts(
+    charts: Sequence[Chart], x_axes: Mapping[str, NDArray[np.float64]]
+) -> tuple[list[Markup], list[dict[str, Any]]]:
+    """Charts whose points have the places of `x_axes` (column of X_AXES -> [K]), the same ones on every axis.
 
-    figure: Markup
-    points: dict[str, Any]
-    """`axes`: column of X_AXES -> pixels across of each point; `texts`: the same -> what is shown at each point, or
-    under "" what is shown on all axes."""
-
-
-def draw_charts(charts: Sequence[Chart], x_axes: Mapping[str, NDArray[np.float64]]) -> list[Drawn]:
-    """Charts whose points have the places of `x_axes` (column of X_AXES -> [K]), the same ones on every axis."""
-    drawn = []
+    Returns:
+        figures; what the script needs of each: in `axes` column of X_AXES -> pixels across of each point, and in
+        `texts` the same -> what is shown at each point, or under "" what is shown on all axes.
+    """
+    figures, points = [], []
     for chart in charts:
         figure, axes = draw({column: (chart, x_K) for column, x_K in x_axes.items()})
         texts = [
             f"generation {x_axes['generation'][k]:,.0f}: {values_text(chart, k)}"
             for k in range(len(x_axes["generation"]))
         ]
-        drawn.append(Drawn(figure, {"axes": axes, "texts": {"": texts}}))
-    return drawn
+        figures.append(figure)
+        points.append({"axes": axes, "texts": {"": texts}})
+    return figures, points
 
 
 def draw(chart_on: Mapping[str, tuple[Chart, NDArray[np.float64]]]) -> tuple[Markup, dict[str, list[float]]]:

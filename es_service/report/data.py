@@ -15,20 +15,13 @@ from numpy.typing import NDArray
 
 from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
-from es_service.loop.parts import (
-    BEST,
-    CELL_PREFIX,
-    ELITE_PREFIX,
-    GEOMETRY_PART,
-    map_from_parts,
-)
+from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.store.digest import checked_parts, digest_of
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
 from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
@@ -122,8 +115,10 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     data = run_data(folder, sound, driver)
     if not digest or driver is not None or sound.newest is None:
         return data
-    problems = list(data.problems)
-    return replace(data, digest=_digest(folder, problems), problems=tuple(problems))
+    try:
+        return replace(data, digest=data.status.run.digest())
+    except StoreError as error:
+        return replace(data, problems=data.problems or (error.sentence,))
 
 
 def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) -> RunData:
@@ -132,6 +127,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     run = Run(folder)
     run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
+    spec, point_D = task.parameters, None if best is None else best.get(POINT)
     return RunData(
         folder=folder,
         meta=found.meta,
@@ -146,13 +142,8 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         platforms=found.platforms,
         digest="",
         problems=tuple(problems),
-        best_parameters={} if best is None or POINT not in best else _named(task, best[POINT]),
+        best_parameters={} if spec is None or point_D is None else spec.named(point_D),
     )
-
-
-def _named(task: TaskSpec, point_D: NDArray[Any]) -> dict[str, float]:
-    """Parameters of a function that is the task by name; empty for other tasks."""
-    return {} if task.parameters is None else task.parameters.named(point_D)
 
 
 def _kept(part: str, arrays: Arrays) -> Arrays | None:
@@ -161,7 +152,7 @@ def _kept(part: str, arrays: Arrays) -> Arrays | None:
     if part == BEST:
         point = {POINT: arrays[POINT]} if arrays[POINT].size <= MOST_PARAMETERS else {}  # or it is a policy's
         return {name: arrays[name] for name in ("generation", "fitness")} | point
-    return arrays if part == GEOMETRY_PART or part.startswith(CELL_PREFIX) else None
+    return arrays if is_light(part) else None
 
 
 def _kept_without_paths(part: str, arrays: Arrays) -> Arrays | None:
@@ -201,13 +192,3 @@ def _certified(folder: Path, problems: list[str]) -> Certified | None:
         if error.sentence not in problems:
             problems.append(error.sentence)
         return None
-
-
-def _digest(folder: Path, problems: list[str]) -> str:
-    """The digest, after all stored data were checked; empty if data are damaged, which then becomes a problem."""
-    try:
-        return digest_of(checked_parts(folder)[0])
-    except StoreError as error:
-        if not problems:
-            problems.append(error.sentence)
-        return ""

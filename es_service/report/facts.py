@@ -164,7 +164,7 @@ def number(value: float) -> str:
         return f"{value:,.0f}"
     if size and size < 1e-3:
         return f"{value:.2e}"
-    return f"{value:.{0 if size >= 1000 else 1 if size >= 100 else 2 if size >= 1 else 3}f}"
+    return f"{value:.{1 if size >= 100 else 2 if size >= 1 else 3}f}"
 
 
 def count(how_many: int, what: str) -> str:

@@ -9,8 +9,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,26 +35,6 @@ TENTHS = 10.0
 """Paths are stored in tenths of a pixel."""
 
 
-class MapView(NamedTuple):
-    """The map as markup, and what its script needs."""
-
-    figure: Markup
-    explanation: str
-    """How to read the figure; one or two sentences."""
-    cells: dict[str, Any]
-    """`rows`: number of a cell -> [name, text]; `overlay`: whether paths are drawn above the map."""
-    path_figure: Markup | None
-    """Empty figure for the path of a chosen cell where it cannot be drawn above the map."""
-
-
-def map_view(data: RunData) -> MapView:
-    """The behaviour map of a run, which must have one."""
-    assert data.map is not None
-    figure, explanation, frame = draw_map(data)
-    cells = {"rows": _rows(data), "overlay": frame is not None}
-    return MapView(figure, explanation, cells, _path_figure(data) if frame is None else None)
-
-
 def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, Frame | None]:
     """Figure, explanation, and for two dimensions the frame of the plane.
 
@@ -70,16 +51,18 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
         shapes = (
             _rectangles(map_, frame, level_N) if isinstance(map_.geometry, Grid) else _voronoi(map_, frame, level_N)
         )
-        content = [floor.ground(frame, data.names), *shapes, floor.walls_and_goal(frame, data.task), _overlay()]
+        path = tag("g", class_="path")  # of a chosen cell
+        content = [floor.ground(frame, data.names), *shapes, floor.walls_and_goal(frame, data.task), path]
         return _svg(content, *floor.size(frame)), "Each cell shows the fitness of its elite.", frame
     if isinstance(map_.geometry, Cvt):
         text = (
             f"Each point is an elite, at its place in {min(dimensions, PAIRED_DIMENSIONS)} of {dimensions} dimensions."
         )
-        return _pairs(data, level_N), text, None
+        return _pairs(map_, data.names, level_N), text, None
     if dimensions == 1:
-        return _bars(data, level_N, colours), "Each bar is a cell; its height is the fitness of its elite.", None
-    return _stacked(data, level_N)
+        text = "Each bar is a cell; its height is the fitness of its elite."
+        return _bars(map_, data.names, level_N, colours), text, None
+    return _stacked(map_, data.names, level_N)
 
 
 def has_area(map_: BehaviourMap) -> bool:
@@ -109,11 +92,6 @@ def colour_bar(colours: Range, *, cells: bool = False) -> Markup:
             class_="key") if cells else None,
         class_="legend",
     )  # fmt: skip
-
-
-def _overlay() -> Markup:
-    """Empty group for the path of a chosen cell."""
-    return tag("g", class_="path")
 
 
 def _svg(content: list[Markup], width: float, height: float, class_: str = "map cells") -> Markup:
@@ -164,9 +142,7 @@ def _voronoi(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> li
     return polygons
 
 
-def _bars(data: RunData, level_N: NDArray[np.int64], colours: Range) -> Markup:
-    map_ = data.map
-    assert map_ is not None
+def _bars(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64], colours: Range) -> Markup:
     assert isinstance(map_.geometry, Grid)
     low, high = spread([map_.fitness_N, np.array(colours)])
     frame = Frame(map_.geometry.bounds[0], (low, high), 64, 8, floor.WIDTH - 74, 220)
@@ -175,12 +151,10 @@ def _bars(data: RunData, level_N: NDArray[np.int64], colours: Range) -> Markup:
         _rectangle(cell, colour, across[cell], top, across[cell + 1], bottom)
         for cell, colour, top in zip(map_.cell_N, level_N, frame.down(np.maximum(map_.fitness_N, low)), strict=True)
     ]
-    return _svg([axis_lines(frame, data.names[0]), *bars], floor.WIDTH, bottom + 40)
+    return _svg([axis_lines(frame, names[0]), *bars], floor.WIDTH, bottom + 40)
 
 
-def _stacked(data: RunData, level_N: NDArray[np.int64]) -> tuple[Markup, str, None]:
-    map_ = data.map
-    assert map_ is not None
+def _stacked(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64]) -> tuple[Markup, str, None]:
     shape = map_.geometry.shape
     right, up = range(0, len(shape), 2), range(1, len(shape), 2)
     columns, rows = (int(np.prod([shape[b] for b in axes])) for axes in (right, up))
@@ -199,16 +173,14 @@ def _stacked(data: RunData, level_N: NDArray[np.int64]) -> tuple[Markup, str, No
     for j in range(1, shape[1]):
         y = f"{float(frame.down(j * rows / shape[1])):.1f}"
         content.append(tag("line", x1=8, x2=8 + width, y1=y, y2=y, class_="block"))
-    order = [" then ".join(data.names[b] for b in axes) for axes in (right, up)]
+    order = [" then ".join(names[b] for b in axes) for axes in (right, up)]
     text = (
         f"Each cell shows the fitness of its elite. To the right: {order[0]}; upwards: {order[1]}, from large to small."
     )
     return _svg(content, width + 16, height + 16), text, None
 
 
-def _pairs(data: RunData, level_N: NDArray[np.int64]) -> Markup:
-    map_ = data.map
-    assert map_ is not None
+def _pairs(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64]) -> Markup:
     bounds = map_.geometry.bounds
     figures = []
     for a, b in combinations(range(min(len(bounds), PAIRED_DIMENSIONS)), 2):
@@ -223,12 +195,12 @@ def _pairs(data: RunData, level_N: NDArray[np.int64]) -> Markup:
                 strict=True,
             )
         ]
-        content = [floor.ground(frame, (data.names[a], data.names[b])), *points]
+        content = [floor.ground(frame, (names[a], names[b])), *points]
         figures.append(_svg(content, *floor.size(frame), class_="map small"))
     return tag("div", *figures, class_="pairs")
 
 
-def _rows(data: RunData) -> dict[str, list[str]]:
+def cell_rows(data: RunData) -> dict[str, list[str]]:
     """Number of a cell -> its name and its values in words."""
     map_, rows = data.map, {}
     assert map_ is not None
@@ -280,7 +252,8 @@ def _path_frame(data: RunData) -> Frame:
     return Frame((0.0, steps), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48)
 
 
-def _path_figure(data: RunData) -> Markup:
+def path_figure(data: RunData) -> Markup:
+    """Empty figure for the path of a chosen cell where it cannot be drawn above the map."""
     shown = min(len(data.names), PAIRED_DIMENSIONS)
     legend = [tag("span", tag("i", class_=f"dot s{b}"), data.names[b], class_="key") for b in range(shown)]
     box = tag("rect", x=40, y=8, width=floor.WIDTH - 50, height=PATH_HEIGHT - 48, class_="ground")
@@ -291,7 +264,7 @@ def _path_figure(data: RunData) -> Markup:
             tag("text", "high", x=0, y=16, class_="tick"),
         ]
     )
-    chart = tag("svg", box, labels, _overlay(), viewBox=f"0 0 {floor.WIDTH} {PATH_HEIGHT}", class_="map")
+    chart = tag("svg", box, labels, tag("g", class_="path"), viewBox=f"0 0 {floor.WIDTH} {PATH_HEIGHT}", class_="map")
     caption = tag("figcaption", "Descriptor in the course of the chosen elite's episode, between the map's bounds")
     return tag("figure", caption, chart, tag("div", *legend, class_="legend"))
 

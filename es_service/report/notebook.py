@@ -35,9 +35,7 @@ def _page(data: RunData) -> str:
     sections, points = [tag("section", *said, *problems, id="what")], []
     if data.history["generation"].size:
         charts = [chart for chart in series.charts(data.history, data.centres) if chart.title in SHOWN]
-        drawn = curves.draw_charts(charts, {"generation": series.x_axes(data.history)["generation"]})
-        points = [chart.points for chart in drawn]
-        shown = [chart.figure for chart in drawn]
+        shown, points = curves.draw_charts(charts, {"generation": series.x_axes(data.history)["generation"]})
         if data.map is not None and data.map.size:
             figure, explanation, _ = maps.draw_map(data)
             bar = maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))

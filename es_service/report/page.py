@@ -7,8 +7,8 @@ from importlib import resources
 from typing import Any
 
 from es_service.protocol.parameters import FREE
-from es_service.report import cloud as clouds
 from es_service.report import curves, facts, maps, series
+from es_service.report.cloud import cloud
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
 from es_service.report.markup import Markup, data_script, table, tag
@@ -52,7 +52,7 @@ def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Ma
     """The sections of a run's page by their ids, in order (that of replays is empty), and the data of its script.
 
     Args:
-        evaluate: see `run_page`; None: the page asks `cell_details` for what it shows of a chosen cell.
+        evaluate: see `run_page`; None: the page asks for the path of a chosen cell, and for what evaluates it.
     """
     sections, scripts = {"what": _head(data)}, {}
     if data.history["generation"].size:
@@ -67,11 +67,6 @@ def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Ma
         if parameters := _parameters(data):
             sections["parameters"] = parameters
     return sections, scripts
-
-
-def cell_details(data: RunData, cell: int, evaluate: Evaluate) -> dict[str, Any]:
-    """What the page shows of a chosen cell: its path, which `data.paths` must have, and the call that evaluates it."""
-    return maps.path_lines(data) | {"evaluate": evaluate(data.cell_name(cell))}
 
 
 def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], libraries: list[str] | None = None) -> str:
@@ -131,8 +126,8 @@ def _head(data: RunData) -> Markup:
 
 
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
-    drawn = curves.draw_charts(series.charts(data.history, data.centres), series.x_axes(data.history))
-    scripts["charts"] = [chart.points for chart in drawn]
+    charts, axes = series.charts(data.history, data.centres), series.x_axes(data.history)
+    figures, scripts["charts"] = curves.draw_charts(charts, axes)
     generations = data.history["generation"].size
     together = series.groups(generations)[0]
     grouped = None
@@ -143,7 +138,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     return section(
         "Curves",
         axis_choice(series.X_AXES),
-        tag("div", *(chart.figure for chart in drawn), class_="charts"),
+        tag("div", *figures, class_="charts"),
         grouped,
         id_="curves",
     )
@@ -156,9 +151,10 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
         return section("Behaviour map", tag("p", text), id_="map")
     if not data.map.size:
         return section("Behaviour map", tag("p", "No cell is filled yet."), id_="map")
-    view = maps.map_view(data)
-    names = {cell: row[0] for cell, row in view.cells["rows"].items()}
-    scripts["map"] = view.cells
+    figure, explanation, frame = maps.draw_map(data)
+    rows = maps.cell_rows(data)
+    scripts["map"] = {"rows": rows, "overlay": frame is not None}  # overlay: paths are drawn above the map
+    names = {cell: row[0] for cell, row in rows.items()}
     if evaluate is not None:
         scripts["map"] |= maps.path_lines(data) | {"evaluate": {cell: evaluate(name) for cell, name in names.items()}}
     detours = data.task.walls if evaluate is None else scripts["map"]["detours"]
@@ -166,15 +162,15 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
     scripts["map"]["first"] = fittest
     return section(
         "Behaviour map",
-        tag("p", f"{view.explanation} {MAP_NOTE}{f' {DETOUR_NOTE}' if detours else ''}", class_="note"),
+        tag("p", f"{explanation} {MAP_NOTE}{f' {DETOUR_NOTE}' if detours else ''}", class_="note"),
         tag(
             "div",
-            tag("div", view.figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),
+            tag("div", figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),
             tag(
                 "div",
                 tag("h3", "Chosen cell"),
                 tag("p", id="cell", class_="readout", aria_live="polite"),
-                view.path_figure,
+                maps.path_figure(data) if frame is None else None,
                 tag("p", "Evaluate its elite on fresh episodes:", class_="note"),
                 tag("pre", id="command"),
                 tag("p", "Its stored fitness is the highest of many noisy means; fresh episodes show how much of it "
@@ -187,23 +183,23 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
 
 
 def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
-    cloud = clouds.cloud(data)
-    if cloud is None:
+    drawn = cloud(data)
+    if drawn is None:
         return section("Evaluated centres", tag("p", "No valid centre was evaluated."), id_="centres")
-    scripts["cloud"] = cloud.points
-    last = len(cloud.points["stops"]) - 1
+    figure, scripts["cloud"], colours, explanation = drawn
+    last = len(scripts["cloud"]["stops"]) - 1
     slider = Markup(f'<input type="range" id="until" min="0" max="{last}" value="{last}" aria-label="generation">')
     return section(
         "Evaluated centres",
-        tag("p", cloud.explanation, class_="note"),
+        tag("p", explanation, class_="note"),
         tag(
             "div",
-            cloud.figure,
+            figure,
             tag(
                 "div",
                 tag("h3", "Until a generation"),
                 tag("div", slider, tag("span", id="until-text", class_="readout"), class_="slider"),
-                maps.colour_bar(cloud.colours),
+                maps.colour_bar(colours),
             ),
             class_="columns",
         ),

@@ -164,7 +164,8 @@ def curves(
         if len(all_data) == 1:
             axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
             continue
-        low_K, median_K, high_K = compare.quartiles_at(group, column, against, x_K)
+        y_R_K = compare.values_at(group, column, against, x_K)
+        low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
         axes.plot(x_K, median_K, label=group.name, **style)
         axes.fill_between(x_K, low_K, high_K, color=style["color"], alpha=0.18, linewidth=0)
     axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))

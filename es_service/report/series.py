@@ -35,7 +35,6 @@ class Line(NamedTuple):
     """A curve: its label and its values, [K]."""
 
     label: str
-    column: str
     y_K: NDArray[np.float64]
     range_K: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     """(low [K], high [K]) of the region around the curve, such as the interval of a median."""
@@ -127,7 +126,7 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
     chart_list = []
     for spec in _SPECS:
         lines = tuple(
-            Line(label, column, thinned(history[column], ends_K, group))
+            Line(label, thinned(history[column], ends_K, group))
             for label, column, group in spec.lines
             if column in history and np.isfinite(history[column]).any()
         )

@@ -78,7 +78,7 @@ def write_report(
 
 
 def write_comparison(
-    folders: Sequence[AnyPath],
+    folders: Iterable[AnyPath | RunData],
     out: AnyPath,
     group_by: Sequence[str] = (),
     threshold: float | None = None,
@@ -87,6 +87,7 @@ def write_comparison(
     """Write the page that compares runs of one task and return the files written, the page first.
 
     Args:
+        folders: those of the runs; a run that is read already can stand for its folder.
         group_by: config keys that group the runs; see `compare.grouped`.
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
         figures: folder to write figures into; None: none are written.
@@ -95,27 +96,17 @@ def write_comparison(
         ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
             finished generation. StoreError: a run cannot be read, or a file cannot be written.
     """
-    return write_compared(map(read_compared, map(Path, folders)), out, group_by, threshold, figures)
+    if figures is not None:
+        empty_figure()  # a missing matplotlib is reported before anything is read
+    read = (run if isinstance(run, RunData) else read_compared(Path(run)) for run in folders)
+    different = list({run.folder.resolve(): run for run in read}.values())  # a run that is given twice counts once
+    page = write_page(comparison_page(different, group_by, threshold), Path(out))
+    return [page, *(write_figures(different, Path(figures), group_by, threshold) if figures is not None else [])]
 
 
 def read_compared(folder: Path) -> RunData:
     """What a comparison needs of a run. Raises StoreError if the run cannot be read."""
     return read_run(folder, paths=False, digest=False)
-
-
-def write_compared(
-    runs: Iterable[RunData],
-    out: AnyPath,
-    group_by: Sequence[str] = (),
-    threshold: float | None = None,
-    figures: AnyPath | None = None,
-) -> list[Path]:
-    """The same for runs that are read already, or while this function iterates over them."""
-    if figures is not None:
-        empty_figure()  # a missing matplotlib is reported before anything is read
-    different = list({run.folder.resolve(): run for run in runs}.values())  # a run that is given twice counts once
-    page = write_page(comparison_page(different, group_by, threshold), Path(out))
-    return [page, *(write_figures(different, Path(figures), group_by, threshold) if figures is not None else [])]
 
 
 def write_page(page: str, file: Path, ways_out: Sequence[WayOut] = ()) -> Path:

@@ -25,7 +25,8 @@ from starlette.routing import Route
 from es_service.errors import ConfigError, ServiceError
 from es_service.loop.parts import elite_part
 from es_service.report.data import TRACE, RunData
-from es_service.report.page import Evaluate, asset, cell_details
+from es_service.report.maps import path_lines
+from es_service.report.page import Evaluate, asset
 from es_service.report.replays import replay_section
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.view import open_run
@@ -148,7 +149,8 @@ class Site:
             paths = {cell: open_run(run.folder).parts(wanted=lambda name: name == part)[1][part][TRACE]}
         except (ServiceError, KeyError):  # it is damaged, which the page says
             paths = {}
-        return cell_details(replace(data, paths=paths), cell, self._evaluate(run.folder))
+        path = path_lines(replace(data, paths=paths))
+        return path | {"evaluate": self._evaluate(run.folder)(data.cell_name(cell))}
 
     async def _replay(self, request: Request) -> Response:
         run, which = await self._found(request.path_params["key"]), request.path_params["which"]

@@ -132,10 +132,9 @@ def test_a_data_script_cannot_be_left():
 )
 def test_every_kind_of_map_shows_every_filled_cell(tmp_path, dimensions, settings, shape):
     data = read_run(write_run(tmp_path / "run", settings, task=task_with(dimensions)))
-    view = maps.map_view(data)
-    figure = str(view.figure)
+    figure = str(maps.draw_map(data)[0])
     drawn = re.findall(rf'<{shape}[^>]* data-c="(\d+)"', figure)
-    assert {int(cell) for cell in drawn} == set(data.map.cell_N.tolist()) == {int(cell) for cell in view.cells["rows"]}
+    assert set(drawn) == set(map(str, data.map.cell_N.tolist())) == set(maps.cell_rows(data))
     assert len(drawn) == data.map.size * (6 if shape == "circle" else 1)  # pairs of the first four dimensions
     assert Elements(page_of(data.folder)).open == []
 
@@ -143,13 +142,13 @@ def test_every_kind_of_map_shows_every_filled_cell(tmp_path, dimensions, setting
 def test_cells_and_paths_are_drawn_where_they_are(tmp_path):
     """The cell of the upper left corner of PointMaze, and its path's end in its middle."""
     data = read_run(write_run(tmp_path / "run", filled=1.0))
-    view = maps.map_view(data)
+    figure = str(maps.draw_map(data)[0])
     cell = 19  # 0,19: lowest x, highest y
     x, y, width, height = (
-        float(re.search(rf'<rect[^>]* {name}="([\d.]+)"[^>]* data-c="{cell}"', str(view.figure))[1])
+        float(re.search(rf'<rect[^>]* {name}="([\d.]+)"[^>]* data-c="{cell}"', figure)[1])
         for name in ("x", "y", "width", "height")
     )
-    ground = re.search(r'<rect x="([\d.]+)" y="([\d.]+)" width="([\d.]+)"', str(view.figure))
+    ground = re.search(r'<rect x="([\d.]+)" y="([\d.]+)" width="([\d.]+)"', figure)
     assert (x, y) == (float(ground[1]), float(ground[2]))
     assert width == height == pytest.approx(float(ground[3]) / 20, abs=0.06)
     found = maps.path_lines(data)
