@@ -57,11 +57,7 @@ from es_service.protocol.machine import VERSION
 from es_service.store.folder import holds_run
 
 _LOG = logger(__name__)
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:

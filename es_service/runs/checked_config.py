@@ -31,13 +31,7 @@ def load_config(source: Source, overrides: Overrides = (), *, new: bool = True, 
     """
     return accepted(
         loading.load_config(
-            source,
-            overrides,
-            tasks=TASKS,
-            algorithms=ALGORITHMS,
-            rollouts=ROLLOUTS,
-            new=new,
-            searches=searches,
+            source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS, new=new, searches=searches
         )
     )
 

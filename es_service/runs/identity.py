@@ -119,13 +119,7 @@ class Recorder:
         self._workers: frozenset[str] | None = None
         self.part = store.part
 
-    def commit(
-        self,
-        generation: int,
-        parts: Changes,
-        history: HistoryRow,
-        evaluations: Table,
-    ) -> None:
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 
         Raises:

@@ -58,12 +58,7 @@ class SelectionRecord:
 
 
 def halved(
-    engine: Evaluator,
-    given: Sequence[Parameters],
-    seed: int,
-    number: int,
-    keep: int,
-    by: Measure,
+    engine: Evaluator, given: Sequence[Parameters], seed: int, number: int, keep: int, by: Measure
 ) -> tuple[list[SelectionRecord], int]:
     """The `keep` best candidates by successive halving, best first, and the environment steps that it took.
 
@@ -88,13 +83,7 @@ def halved(
 
 
 def new_episodes(
-    engine: Evaluator,
-    policies: Sequence[Parameters],
-    episodes: int,
-    seed: int,
-    number: int,
-    ask: int,
-    domain: Domain,
+    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
 ) -> list[EpisodesResult]:
     """Results [E] of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
     number, ask) determines."""

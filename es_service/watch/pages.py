@@ -27,19 +27,8 @@ NO_REPLAY = (
     "Click a cell of the map, or choose one with the arrow keys and press Enter, to see its elite's episode here."
 )
 HEADS = (
-    "",
-    "run",
-    "state",
-    "generation",
-    "steps",
-    "steps/s",
-    "best",
-    "certified",
-    "coverage",
-    "task",
-    "search",
-    "seed",
-)
+    "", "run", "state", "generation", "steps", "steps/s", "best", "certified", "coverage", "task", "search", "seed"
+)  # fmt: skip
 
 
 def shell(title: str, events: str, base: str = "") -> str:

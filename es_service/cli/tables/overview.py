@@ -49,12 +49,7 @@ def _without_row(folder: Path, state: str) -> tuple[str, ...]:
 
 def _row(status: RunStatus) -> tuple[str, ...]:
     constants, limits, row = status.run.constants, status.limits, status.row
-    who = (
-        str(status.run.folder),
-        constants["search.algorithm"],
-        constants["task.environment"],
-        str(constants["seed"]),
-    )
+    who = (str(status.run.folder), constants["search.algorithm"], constants["task.environment"], str(constants["seed"]))
     if row is None:
         return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(status))
     generations, steps = limits.get("generations"), limits.get("env_steps")
