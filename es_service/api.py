@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
@@ -21,7 +20,7 @@ from es_service.runs import view
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome
+from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, warn
 from es_service.runs.sessions import Listener, continue_run, create_run
 from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
@@ -39,10 +38,6 @@ def _draw_for_notebook(run: Run) -> str:
 
 
 view.draw_for_notebook = _draw_for_notebook
-
-
-def warn(notice: str) -> None:
-    warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
 def _ignore(sentence: str) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.api import run_or_resume, warn
+from es_service.api import run_or_resume
 from es_service.config.caller import CALLER
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
@@ -30,7 +30,7 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
 from es_service.runs.checked_config import load_config
-from es_service.runs.session import CallerLeft, OnNotice, Outcome
+from es_service.runs.session import CallerLeft, OnNotice, Outcome, warn
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
 from workers.asking import Rows, Told, gradients, results_of, rows_of

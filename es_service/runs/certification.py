@@ -12,7 +12,6 @@ Axes: N candidates, E episodes, D policy parameters, O observation.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -42,6 +41,7 @@ from es_service.runs.evaluation import Candidate, candidates, evaluation_config,
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.selection import Parameters, halved, kept, new_episodes
+from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.store.writer import RunStore
 
@@ -49,10 +49,6 @@ OTHER_PROGRAMS = 2**40
 """Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
 TOP = 10
 """Default number of elites that are candidates beside the best centre."""
-
-
-def _warn(notice: str) -> None:
-    warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,7 @@ def certify_run(
     keep: int = 1,
     by: Measure | None = None,
     workers: int | None = None,
-    on_notice: Callable[[str], None] = _warn,
+    on_notice: Callable[[str], None] = warn,
 ) -> list[Certified]:
     """Certify policies of a run on this machine, and store the results in the run.
 
@@ -111,15 +107,7 @@ def certify_run(
         _measure(config, by)  # refused before workers start if wrong
         if top is None:
             top = TOP if config.map.enabled else 0
-        chosen = candidates(
-            run,
-            best=best,
-            centre=centre,
-            cells=cells,
-            every=False,
-            top=top,
-            generation=generation,
-        )
+        chosen = candidates(run, best=best, centre=centre, cells=cells, every=False, top=top, generation=generation)
         if not chosen:
             raise NotInRunError(f"{run.folder}: there is no policy to certify; its map is empty", run=run.folder)
         with _engine(config, on_notice) as engine:

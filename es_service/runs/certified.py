@@ -6,7 +6,7 @@ Axes: E episodes, D policy parameters, O observation, B descriptor dimensions.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -142,17 +142,7 @@ def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
 
 
 _POLICY = ("parameters_D", "observation_mean_O", "observation_std_O")
-_FACTS = (
-    "name",
-    "generation",
-    "stored_fitness",
-    "selected_by",
-    "selection_mean",
-    "selection_episodes",
-    "candidates",
-    "selection_steps",
-    "platform",
-)
+_FACTS = [field.name for field in fields(Certified) if field.name not in (*_POLICY, "number", "rank", "episodes")]
 
 
 def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

@@ -197,7 +197,7 @@ def evaluate(
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
-            centres = [_centre(candidate.policy, seed) for candidate in group]
+            centres = [centre_of(candidate.policy, FRESH_GENERATION + seed) for candidate in group]
             for candidate, (fitness, descriptors, successes) in zip(
                 group, _totals(engine, centres, episodes), strict=True
             ):
@@ -256,6 +256,6 @@ def _added(total: _Totals, part: _Totals) -> _Totals:
     return merge_moments(total[0], [part[0]]), merge_moments(total[1], [part[1]]), total[2] + part[2]
 
 
-def _centre(policy: Policy, seed: int) -> Centre:
-    mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
-    return Centre(FRESH_GENERATION + seed, policy.parameters_D, 0.0, mean_O, std_O)
+def centre_of(policy: Policy, generation: int) -> Centre:
+    """A policy as a centre of a generation, to be evaluated without noise."""
+    return Centre(generation, policy.parameters_D, 0.0, policy.observation_mean_O, policy.observation_std_O)

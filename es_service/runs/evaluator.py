@@ -6,11 +6,10 @@ E episodes, D policy parameters, O observation, A action, B descriptor dimension
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from threading import Lock
-from types import TracebackType
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -177,16 +176,15 @@ class PolicyEvaluator:
 class Evaluating(AbstractContextManager[PolicyEvaluator]):
     """What `evaluator` returns: a context manager of a PolicyEvaluator."""
 
-    def __init__(self, started: AbstractContextManager[PolicyEvaluator]) -> None:
-        self._started = started
+    def __init__(self, start: Callable[[], PolicyEvaluator]) -> None:
+        self._start = start
 
     def __enter__(self) -> PolicyEvaluator:
-        return self._started.__enter__()
+        self._made = self._start()
+        return self._made
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return self._started.__exit__(kind, error, trace)
+    def __exit__(self, *raised: object) -> None:
+        self._made.close()
 
     def __call__(self, *arguments: object, **named: object) -> NoReturn:
         """Say how it is meant."""
@@ -221,7 +219,7 @@ def evaluator(
     Raises:
         ConfigError: the config is wrong. EvaluationError: the workers cannot be started.
     """
-    return Evaluating(_started(config, workers, engine, address, transitions))
+    return Evaluating(lambda: _started(config, workers, engine, address, transitions))
 
 
 def transitions_of(result: EpisodesResult) -> Transitions:
@@ -276,20 +274,15 @@ def statistics_of(
     return statistics[0], statistics[1]
 
 
-@contextmanager
 def _started(
     config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None, transitions: bool
-) -> Iterator[PolicyEvaluator]:
+) -> PolicyEvaluator:
     """See `evaluator`."""
     config = evaluating_config(config, workers, engine, address)
     task = task_of(config)  # before the workers start, since it may raise
     outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
     started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs)
-    made = PolicyEvaluator(config, task, started)
-    try:
-        yield made
-    finally:
-        made.close()
+    return PolicyEvaluator(config, task, started)
 
 
 def evaluating_config(

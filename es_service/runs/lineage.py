@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -132,22 +133,15 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     if "search.parent_statistics" in changed and constants["search.parent_statistics"] == "global":
         parts = _without_elite_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
-    return _lineage(origin, at), Beginning(
-        _history(origin, at), parts, platforms, newest=at, evaluations=_evaluations(origin, at)
-    )
+    history, evaluations = (_in_pieces(read, origin, at) for read in (reader.read_history, reader.read_evaluations))
+    return _lineage(origin, at), Beginning(history, parts, platforms, newest=at, evaluations=evaluations)
 
 
-def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
-    """History rows up to a generation, read in several transactions: a long history may not fit into memory, and a
-    driver cannot shorten its write-ahead log while a transaction reads it."""
+def _in_pieces(read: Callable[[Path, int, int], Sequence[Any]], origin: Run, newest: int) -> Iterator[Any]:
+    """What `read` returns up to generation `newest`, in several transactions: a long history may not fit into memory,
+    and a driver cannot shorten its write-ahead log while a transaction reads it."""
     for first in range(0, newest + 1, ROWS_AT_ONCE):
-        yield from reader.read_history(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
-
-
-def _evaluations(origin: Run, newest: int) -> Iterator[reader.EvaluatedCentres]:
-    """Centres evaluated up to generation `newest`, read like the history."""
-    for first in range(0, newest + 1, ROWS_AT_ONCE):
-        yield from reader.read_evaluations(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
+        yield from read(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
 
 def _without_fitness(parts: Parts) -> dict[str, Arrays]:
@@ -271,21 +265,16 @@ def _by_choice(snapshot: Snapshot, map_: BehaviourMap, config: RunConfig, search
 
 
 def _tell_otherwise(origin: Run, config: RunConfig, tell: Callable[[str], None]) -> None:
-    if other := _seen_otherwise(origin, config):
+    """Tell of changed settings with which the origin's policy acts differently. Normalisation that is newly enabled is
+    not among them: it starts without statistics."""
+    old, new = origin.constants, config.constants()
+    changed = [name for name in OBSERVED if old[name] != new[name] and not (name == NORMALISED and new[name])]
+    if changed:
+        other = ", ".join(f"{name}: {show(old[name])} -> {show(new[name])}" for name in changed)
         tell(
             f"search.init_from: this run processes observations differently from {origin.folder} ({other}), so the "
             "policy taken from there may act differently"
         )
-
-
-def _seen_otherwise(origin: Run, config: RunConfig) -> str:
-    """The changed settings with which the origin's policy acts differently; empty if there are none. Normalisation
-    that is newly enabled is not among them: it starts without statistics."""
-    new = config.constants()
-    changed = [name for name in OBSERVED if origin.constants[name] != new[name]]
-    if new[NORMALISED] and NORMALISED in changed:
-        changed.remove(NORMALISED)
-    return ", ".join(f"{name}: {show(origin.constants[name])} -> {show(new[name])}" for name in changed)
 
 
 def _lineage(origin: Run, generation: int) -> dict[str, Any]:

@@ -25,13 +25,13 @@ from es_service.config.tasks import task_of
 from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info
-from es_service.protocol.messages import Centre, FloatArray
+from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.certified import newest_certified
 from es_service.runs.checked_config import changed_config
-from es_service.runs.evaluation import Candidate, candidates
+from es_service.runs.evaluation import Candidate, candidates, centre_of
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.view import Run
 from es_service.runs.worker_count import GPU
@@ -100,7 +100,7 @@ def record(
         policy, episode = _certified(run, config, now)
         chosen, stored = [policy, *chosen], [episode, *stored]
     requests = [
-        RecordRequest(_centre(candidate), config.seed) if its is None else its.request
+        RecordRequest(centre_of(candidate.policy, candidate.generation), config.seed) if its is None else its.request
         for candidate, its in zip(chosen, stored, strict=True)
     ]
     recorded = _answer((worker_spec(config, task_of(config)), requests))
@@ -117,16 +117,10 @@ def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Can
     fitness_E = certified.episodes.return_E if config.task.fitness == "sum" else certified.episodes.last_reward_E
     episode = int(np.argsort(fitness_E, kind="stable")[(fitness_E.size - 1) // 2])
     candidate = Candidate(CERTIFIED, policy, certified.number, float(fitness_E.mean()))
-    request = RecordRequest(
-        _centre(candidate), config.seed, policy=0, episode=episode, domain=Domain.CERTIFICATION_RESET
-    )
+    centre = centre_of(policy, certified.number)
+    request = RecordRequest(centre, config.seed, policy=0, episode=episode, domain=Domain.CERTIFICATION_RESET)
     changes = tuple(changes_since(certified.platform, now))
     return candidate, StoredEpisode(request, float(fitness_E[episode]), None, changes, certified.number)
-
-
-def _centre(candidate: Candidate) -> Centre:
-    policy = candidate.policy
-    return Centre(candidate.generation, policy.parameters_D, 0.0, policy.observation_mean_O, policy.observation_std_O)
 
 
 def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpisode | None:
@@ -149,7 +143,7 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
     if parent is not None and candidate.generation <= parent["generation"] and reader.read_start(run.folder) is None:
         rollouts = parent.get("rollouts", ["unknown"])  # this run is a fork, and its parent has computed the episode
         changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
-    request = RecordRequest(_centre(candidate), **vars(resets))
+    request = RecordRequest(centre_of(candidate.policy, candidate.generation), **vars(resets))
     return StoredEpisode(request, row["fitness_first"], candidate.trace_T_B, tuple(changes))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
-from es_service.protocol.messages import FloatArray, Moments, TaskSpec, WorkerSpec
+from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
@@ -51,6 +52,11 @@ OnNotice = Callable[[str], None]
 
 Caller = Callable[[WorkerSpec], AbstractContextManager[Any]]
 """Makes an `Engine` that has the caller compute the episodes of a task that has none of its own."""
+
+
+def warn(notice: str) -> None:
+    """Show a notice as a RuntimeWarning; the default for `on_notice`."""
+    warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -136,12 +142,7 @@ def work(
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
         make_engine(
-            config,
-            should_stop,
-            noting(log, spec) if compute.address is None else log,
-            tell_wait,
-            tell,
-            tell_compiling,
+            config, should_stop, noting(log, spec) if compute.address is None else log, tell_wait, tell, tell_compiling
         )
         if caller is None
         else caller(spec) as engine,
@@ -226,6 +227,9 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
     """The engine's number of workers and time limits."""
     compute, task = config.compute, task_of(config)
     rollout = BACKENDS[compute.rollout]
+    limit_s = config.task.time_limit_s  # that of the environments of a chunk, which step side by side
+    if limit_s is not None and task.kind == "function":  # enough for its calls, which end by themselves
+        limit_s = 2 * compute.chunk_pairs * config.task.episodes_per_member * limit_s + CALLS_S
     return Limits(
         workers=worker_count(config, most),
         max_attempts=compute.max_attempts,
@@ -237,19 +241,10 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         no_worker_timeout_s=compute.no_worker_timeout_s,
         items_overlap=not rollout.runs_in_threads,
         late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
-        time_limit_s=chunk_limit_s(config, task),
+        time_limit_s=limit_s,
         episodes_together=rollout.episodes_together(task),
         policies_together=POLICIES_TOGETHER if rollout.takes_chunks_together else POLICY_SLOTS,
     )
-
-
-def chunk_limit_s(config: RunConfig, task: TaskSpec) -> float | None:
-    """Longest time of a chunk where the config has one: that of its environments, which step side by side, or enough
-    for the calls of a function, which end by themselves when they take too long."""
-    limit_s = config.task.time_limit_s
-    if limit_s is None or task.kind != "function":
-        return limit_s
-    return 2 * config.compute.chunk_pairs * config.task.episodes_per_member * limit_s + CALLS_S
 
 
 def make_engine(
@@ -271,38 +266,34 @@ def make_engine(
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
         outputs: see `WorkerSpec.outputs`.
     """
-    spec, compute = worker_spec(config, task_of(config), outputs), config.compute
+    task, compute = task_of(config), config.compute
+    spec = worker_spec(config, task, outputs)
     most = work_at_once(config) if at_once is None else at_once
     limits = dispatch_limits(config, most)
+    engine: Engine[Any]
     if compute.engine == "inline":
         threads = compute.inline_workers == "threads"
         gpus = compute.worker_resources.gpu
         engine = inline_engine(spec, limits, should_stop, threads=threads, gpus=gpus, log=log, on_compile=on_compile)
-        return _describing(engine, config, spec)
-    from es_service.dispatch.ray_engine import ray_engine
+    else:
+        from es_service.dispatch.ray_engine import ray_engine
 
-    engine = ray_engine(
-        spec,
-        limits,
-        should_stop,
-        actor=WorkerActor,
-        address=compute.address,
-        cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
-        gpus=compute.worker_resources.gpu,
-        most=most,
-        grows=compute.workers == "auto",
-        log=log,
-        on_wait=on_wait,
-        on_compile=on_compile,
-        on_refusal=on_refusal,
-    )
-    return _describing(engine, config, spec)
-
-
-def _describing(engine: Engine[Any], config: RunConfig, spec: WorkerSpec) -> Engine[Any]:
-    """The engine, whose errors name the episodes of Python objects or the calls of a function that ended workers."""
-    task = task_of(config)
-    if task.kind in ("python", "function"):
+        engine = ray_engine(
+            spec,
+            limits,
+            should_stop,
+            actor=WorkerActor,
+            address=compute.address,
+            cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
+            gpus=compute.worker_resources.gpu,
+            most=most,
+            grows=compute.workers == "auto",
+            log=log,
+            on_wait=on_wait,
+            on_compile=on_compile,
+            on_refusal=on_refusal,
+        )
+    if task.kind in ("python", "function"):  # errors name the episodes or the calls that ended workers
         engine.describe = partial(described, spec, task.parameters)
     return engine
 

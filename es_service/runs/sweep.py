@@ -67,10 +67,6 @@ OnProgress = Callable[[Sequence[SweptRun]], None]
 """Called with all runs of a sweep, in their order, when a run starts or ends and about once a second."""
 
 
-def _ignore(runs: Sequence[SweptRun]) -> None:
-    """Do nothing; the default for `on_progress`."""
-
-
 def sweep(
     config: Source,
     out: str | os.PathLike[str],
@@ -79,7 +75,7 @@ def sweep(
     seeds: Iterable[int] | None = None,
     overrides: Overrides = (),
     parallel: int | None = None,
-    on_progress: OnProgress = _ignore,
+    on_progress: OnProgress = lambda runs: None,
 ) -> list[SweptRun]:
     """Run a config with every combination of some settings and every seed; each run has a folder in `out`.
 
@@ -110,7 +106,7 @@ def run_planned(
     planned: Sequence[PlannedRun],
     out: Path,
     parallel: int | None = None,
-    on_progress: OnProgress = _ignore,
+    on_progress: OnProgress = lambda runs: None,
     on_notice: OnNotice = _LOG.info,
     options: Sequence[str] = (),
 ) -> list[SweptRun]:
