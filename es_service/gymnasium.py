@@ -23,16 +23,7 @@ def id_of(task: str) -> str:
     return f"es_service/{task.title().replace('_', '')}-v0"
 
 
-def _register() -> None:
-    gymnasium.register("es_service/Task-v0", entry_point=SINGLE, vector_entry_point=VECTOR)
-    for name, task in SHIPPED.items():
-        gymnasium.register(
-            id_of(name),
-            entry_point=SINGLE,
-            vector_entry_point=VECTOR,
-            max_episode_steps=task.episode_steps,
-            kwargs={"task": name},
-        )
-
-
-_register()
+gymnasium.register("es_service/Task-v0", SINGLE, vector_entry_point=VECTOR)
+for _name, _task in SHIPPED.items():
+    _limit, _given = _task.episode_steps, {"task": _name}
+    gymnasium.register(id_of(_name), SINGLE, vector_entry_point=VECTOR, max_episode_steps=_limit, kwargs=_given)

@@ -32,13 +32,7 @@ With a policy, each call also makes the noise of its members, as a chunk of a ru
 
 
 def measure(
-    task: str,
-    options: Mapping[str, str],
-    hidden: list[int],
-    policy: bool,
-    batch: int,
-    seconds: float,
-    rollout: str,
+    task: str, options: Mapping[str, str], hidden: list[int], policy: bool, batch: int, seconds: float, rollout: str
 ) -> dict:
     """Environment steps per second of one process, without the time for compilation.
 

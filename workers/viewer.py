@@ -36,10 +36,5 @@ def shapes(model: Any) -> tuple[Shape, ...]:
             ),
         )
         for geom in range(model.ngeom)
-        if _is_shown(model, geom)
+        if model.geom_type[geom] in KINDS and model.geom_group[geom] < HIDDEN_GROUP and model.geom_rgba[geom][3] > 0
     )
-
-
-def _is_shown(model: Any, geom: int) -> bool:
-    visible = model.geom_group[geom] < HIDDEN_GROUP and model.geom_rgba[geom][3] > 0
-    return int(model.geom_type[geom]) in KINDS and bool(visible)

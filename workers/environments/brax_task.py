@@ -109,12 +109,7 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
 
     viewer = Viewer(system.mj_model, lambda state: state.brax.pipeline_state.x, float(environment.dt))
     return Environment(
-        reset,
-        lambda state: state.brax.obs,
-        step,
-        describe_state,
-        lambda state: jnp.float32(jnp.nan),
-        viewer=viewer,
+        reset, lambda state: state.brax.obs, step, describe_state, lambda state: jnp.float32(jnp.nan), viewer=viewer
     )
 
 

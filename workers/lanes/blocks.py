@@ -42,13 +42,7 @@ class Blocks:
     """Lanes in blocks, divided among child processes."""
 
     def __init__(
-        self,
-        name: str,
-        options: Mapping[str, OptionValue],
-        lanes: int,
-        processes: int = 1,
-        *,
-        first: int = 0,
+        self, name: str, options: Mapping[str, OptionValue], lanes: int, processes: int = 1, *, first: int = 0
     ) -> None:
         """Start the processes, which compile the functions of the task or take them from the cache.
 

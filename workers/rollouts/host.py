@@ -8,12 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, TaskSpec, WorkerSpec
-from es_service.protocol.noise import (
-    NORMAL_STD,
-    Domain,
-    normal_integers,
-    stream_keys,
-)
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recipes import explicit

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
@@ -38,7 +37,13 @@ class Simd(RolloutBackend):
 
     def why_not_here(self) -> str:
         """What the processor lacks."""
-        return _why_not_here()
+        from workers.simd.backend.target import NoVectorsError, host_target
+
+        try:
+            host_target()
+        except NoVectorsError as error:
+            return str(error)
+        return ""
 
     def examine(self, task: TaskSpec) -> str:
         """Why the task's steps cannot be compiled."""
@@ -98,14 +103,3 @@ class Simd(RolloutBackend):
         from workers.simd.episodes.kernel import compile_kernel
 
         return random_steps(compile_kernel, task, options, batch, steps)
-
-
-@cache
-def _why_not_here() -> str:
-    from workers.simd.backend.target import NoVectorsError, host_target
-
-    try:
-        host_target()
-    except NoVectorsError as error:
-        return str(error)
-    return ""

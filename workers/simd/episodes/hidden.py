@@ -201,9 +201,8 @@ def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Call
 
     def block(number: str, _: Values) -> Values:
         first = builder.index((number, members))
-        builder.when(
-            _any_alive(builder, first, members), lambda: builder.loop(layer.tiles, lambda t, _: tile(first, t))
-        )
+        alive = builder.value(f"load <{members} x i32>, ptr {builder.at('%alive', first, 'i32')}, align 4")
+        builder.when(builder.any(alive, members), lambda: builder.loop(layer.tiles, lambda t, _: tile(first, t)))
         return []
 
     builder.loop(builder.width // members, block)
@@ -228,13 +227,6 @@ def _put(
     for v, value in enumerate(activated(builder, layer.activation, sums)):
         place = builder.index((first, vectors), (tile, layer.tile), (member * vectors + v, 1))
         builder.store(builder.llvm_types["f"], value, out.pointer, place)
-
-
-def _any_alive(builder: FunctionBuilder, first: str, members: int) -> str:
-    """An i1 that is true if any of some members, from `first` on, is alive."""
-    return builder.any(
-        builder.value(f"load <{members} x i32>, ptr {builder.at('%alive', first, 'i32')}, align 4"), members
-    )
 
 
 def first_sums(bias: bool, biases: Values) -> Values:

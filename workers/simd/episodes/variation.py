@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 
@@ -23,21 +22,14 @@ from workers.simd.episodes.check import require_same
 from workers.simd.episodes.noise import definition, float_constant, lanes, load_key, noise_of
 
 
-class Variation(Protocol):
-    """Maker of policies from recipes."""
-
-    def __call__(self, recipes: Recipes, out_N_D: FloatArray | None = None) -> FloatArray:
-        """Their parameters, [N, D], in a given or a new array."""
-        ...
-
-
 @cache
-def make_variation(target: Target | None = None) -> Variation:
-    """Function with the results of `Recipes.made`; several threads may call it."""
+def make_variation(target: Target | None = None) -> Callable[..., FloatArray]:
+    """Function of recipes that returns their policies, as `Recipes.made`, in a given array [N, D] or a new one; several
+    threads may call it."""
     target = target or host_target()
     signature = [*[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 3, *[ctypes.c_float] * 2]
 
-    def function(native: Native) -> Variation:
+    def function(native: Native) -> Callable[..., FloatArray]:
         call = native.function(*signature)
 
         def made(recipes: Recipes, out_N_D: FloatArray | None = None) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from workers.simd.frontend.dtypes import graph_dtype
-from workers.simd.frontend.primitives.registry import primitive
+from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -39,34 +39,14 @@ def _slice(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     return x[tuple(slice(*bounds) for bounds in zip(starts, limits, strides, strict=True))]
 
 
-@primitive("transpose")
-def _transpose(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return np.transpose(x, equation.params["permutation"])
-
-
-@primitive("rev")
-def _rev(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return np.flip(x, equation.params["dimensions"])
-
-
-@primitive("concatenate")
-def _concatenate(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
-    return np.concatenate(arrays, equation.params["dimension"])
-
-
-@primitive("stack")
-def _stack(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
-    return np.stack(arrays, equation.params["axis"])
-
-
-@primitive("unstack")
-def _unstack(t: Tracer, equation: Any, x: Nodes) -> list[Nodes]:
-    return list(np.moveaxis(x, equation.params["axis"], 0))
-
-
-@primitive("tile")
-def _tile(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return np.tile(x, equation.params["reps"])
+PRIMITIVES.update(
+    transpose=lambda t, equation, x: np.transpose(x, equation.params["permutation"]),
+    rev=lambda t, equation, x: np.flip(x, equation.params["dimensions"]),
+    concatenate=lambda t, equation, *arrays: np.concatenate(arrays, equation.params["dimension"]),
+    stack=lambda t, equation, *arrays: np.stack(arrays, equation.params["axis"]),
+    unstack=lambda t, equation, x: list(np.moveaxis(x, equation.params["axis"], 0)),
+    tile=lambda t, equation, x: np.tile(x, equation.params["reps"]),
+)
 
 
 @primitive("iota")
