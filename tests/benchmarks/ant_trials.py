@@ -22,9 +22,9 @@ import pandas as pd
 
 from es_service import api
 from es_service.protocol.process_environment import worker_environment
-from es_service.runs import session
 from tests.benchmarks.ants import USUAL, summary
-from tests.benchmarks.science import CONFIGS, in_this_process
+from tests.benchmarks.science import CONFIGS
+from tests.helpers import workers_in_this_process
 
 TABLE = Path(__file__).parent / "results" / "ant_maze_trials.csv"
 RUNS = Path(__file__).parents[2] / "runs" / "ant_trials"
@@ -62,12 +62,12 @@ KEPT = (
 
 def run_one(config: str, seed: int, settings: tuple[str, ...]) -> dict[str, Any]:
     """One run in this process -> its row."""
-    session.make_engine = in_this_process
     folder = RUNS / "_".join([config, str(seed), *settings])
     shutil.rmtree(folder, ignore_errors=True)
     budget = (f"budget.env_steps={ENV_STEPS}", "budget.generations=null", f"seed={seed}")
     chosen = ("compute.engine=inline", "compute.workers=1", *budget, *USUAL, *settings)
-    run = api.run(api.load_config(CONFIGS / f"{config}.yaml", chosen), folder).run
+    with workers_in_this_process():
+        run = api.run(api.load_config(CONFIGS / f"{config}.yaml", chosen), folder).run
     row = summary(config, run)
     shutil.rmtree(folder)
     return {"config": config, "settings": " ".join(settings), "seed": seed, **{key: row[key] for key in KEPT}}

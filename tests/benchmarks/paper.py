@@ -34,11 +34,11 @@ from es_service.dispatch.cores import cores
 from es_service.errors import Interrupted
 from es_service.protocol.machine import cpu_kind
 from es_service.protocol.process_environment import worker_environment
-from es_service.runs import evaluation, session
+from es_service.runs import evaluation
 from es_service.runs.view import Run
 from tests.benchmarks import paper_picture, paper_tables
 from tests.benchmarks.paper_readings import DISTANCE_TASKS, curve, readings
-from tests.benchmarks.science import in_this_process
+from tests.helpers import workers_in_this_process
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs" / "paper"
@@ -91,13 +91,13 @@ class Computed(NamedTuple):
 
 def run_one(wanted: Wanted) -> Computed:
     """One run from its config, or from where it was interrupted."""
-    session.make_engine = in_this_process
     limits = (f"budget.env_steps={wanted.env_steps}", "budget.generations=null", f"seed={wanted.seed}")
     chosen = ("compute.engine=inline", "compute.workers=1", *wanted.settings, *limits)
     config, folder = api.load_config(wanted.config, chosen), RUNS / wanted.name
     code = commit()  # a commit that is made meanwhile is not the one that computes
     try:
-        api.run_or_resume(config, folder)
+        with workers_in_this_process():
+            api.run_or_resume(config, folder)
     except Interrupted:
         if (api.open_run(folder).generation or 0) < 1:
             raise

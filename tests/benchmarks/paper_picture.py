@@ -11,11 +11,19 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from tests.benchmarks import science_picture
 from tests.benchmarks.paper_readings import READINGS, power
 from tests.benchmarks.paper_tables import METHODS, PAPER, TASKS
 
-COLOURS = science_picture.COLOURS | {"memes": "#7b4fa3", "map_elites": "#111111", "ars": "#8bb8c9"}
+COLOURS = {
+    "es": "#777777",
+    "ns_es": "#d1495b",
+    "nsr_es": "#c77d0a",
+    "nsra_es": "#1b6ca8",
+    "me_es": "#2a7f3f",
+    "memes": "#7b4fa3",
+    "map_elites": "#111111",
+    "ars": "#8bb8c9",
+}
 LIMITS = {"point_maze": (-205, -10), "ant_maze": (-62, 3), "ant_trap": (900, 1820)}
 """Limits of the vertical axis for each task; an ant that stands still has 1,000 in AntTrap."""
 LANDMARKS = {"point_maze": ("QD-PG", "SAC"), "ant_maze": ("QD-PG", "PGA-ME", "SAC"), "ant_trap": ("QD-PG", "SAC")}

@@ -6,15 +6,17 @@
 
 `make` computes ten runs with whatever `es_service` Python finds, by its command line alone, so that it serves every
 version: each algorithm, the three tasks, both engines, both rollouts, two runs that are killed (`kill -9`) and resumed,
-one fork. Their configs are frozen in `reference_configs`, in the names of the keys before version 0.13 and in those
-since then. `compare` shows for each run how many arrays (centres, optimisers, statistics, novelty archive, map, elites)
-and how many history values are equal, and exits with 1 if anything is not. Two workers; about two minutes on a Zen 5.
+one fork. Their configs are frozen in `reference_configs`, and written with the older names of two keys for a version
+before 0.13. `compare` shows for each run how many arrays (centres, optimisers, statistics, novelty archive, map,
+elites) and how many history values are equal, and exits with 1 if anything is not. Two workers; about two minutes on a
+Zen 5.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -110,7 +112,6 @@ def make(folder: Path) -> None:
 
     folder.mkdir(parents=True)
     is_older = tuple(map(int, VERSION.split(".")[:2])) < (0, 13)
-    configs = CONFIGS / ("before" if is_older else "after")
     for name, reference in REFERENCES.items():
         run, started = folder / name, time.perf_counter()
         settings = []
@@ -121,7 +122,12 @@ def make(folder: Path) -> None:
         if reference.parent:
             finish(command("fork", folder / reference.parent, "--out", run, *sizes, *settings))
         else:
-            words = command("run", configs / f"{reference.config}.yaml", "--out", run, *sizes, *settings)
+            text = (CONFIGS / f"{reference.config}.yaml").read_text()
+            if is_older:
+                text = re.sub(r"  step:\n    (.*)\n    (.*)\n", r"  \1\n  \2\n", text)
+            config = folder / f"{name}.yaml"
+            config.write_text(text)
+            words = command("run", config, "--out", run, *sizes, *settings)
             if reference.killed_at is None:
                 finish(words)
             else:

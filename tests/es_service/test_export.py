@@ -9,12 +9,11 @@ import pytest
 
 from es_service import api
 from es_service.errors import StoreError
-from es_service.runs import session
 from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
-from tests.benchmarks.science import in_this_process
 from tests.database import database
 
+pytestmark = pytest.mark.usefixtures("workers_here")
 FIRST, LAST = 2, 8
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 10},
@@ -26,8 +25,7 @@ CONFIG = {
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(session, "make_engine", in_this_process)
+def run(tmp_path):
     return api.run(api.load_config(CONFIG), tmp_path / "run").run
 
 

@@ -414,15 +414,6 @@ def time_code(cupy: Any, say: Results) -> None:
         say("code_speed", kib=kib, ns_of_an_instruction_by_warps=ns)
 
 
-def profile(cupy: Any, task: str = "ant_maze", members: int = 8192) -> None:
-    """A few control steps, for a profiler."""
-    file = np.load(HERE / f"{task}_rollout.npz")
-    rollout = Rollout(cupy, task, file, rollout_keys(file, members), "quick_255")
-    rollout.start()
-    rollout.run(4)
-    rollout.stream.synchronize()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=150.0, help="the process ends itself after these")
@@ -451,7 +442,6 @@ def main() -> None:
         ],
         "rollout_speed": [lambda t=t, m=m, s=s: time_rollouts(cupy, say, t, m, s) for t, m, s in rollouts],
         "code_speed": [lambda: time_code(cupy, say)],
-        "profile": [lambda: profile(cupy)],
     }
     failed = 0
     for part in [part for name in names for part in parts[name]]:
