@@ -8,12 +8,7 @@ SQUARE, OBLONG = ((-1.0, 1.0), (-1.0, 1.0)), ((0.0, 30.0), (-8.0, 8.0))
 
 def map_config(task="point_maze", **settings):
     return load_config(
-        {
-            "task": {"environment": task},
-            "search": {"algorithm": "es"},
-            "map": settings,
-            "budget": {"generations": 1},
-        }
+        {"task": {"environment": task}, "search": {"algorithm": "es"}, "map": settings, "budget": {"generations": 1}}
     ).map
 
 

@@ -86,13 +86,7 @@ def test_how_the_last_session_ended_is_known_until_another_one_ends(tmp_path):
 def test_a_holder_that_has_not_yet_written_its_name(tmp_path):
     with (tmp_path / "run.lock").open("w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        assert lock_holder(tmp_path) == {
-            "host": None,
-            "pid": None,
-            "since": None,
-            "waiting_since": None,
-            "doing": None,
-        }
+        assert lock_holder(tmp_path) == {"host": None, "pid": None, "since": None, "waiting_since": None, "doing": None}
         with pytest.raises(RunLockedError, match=r"process \(unknown\) on host \(unknown\)"):
             acquire_lock(tmp_path)
 

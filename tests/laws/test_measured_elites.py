@@ -300,12 +300,7 @@ def run_of(tmp_path, name="eme", *, corner=False, generations=6, correct=3, epis
     config = {
         "task": {"environment": "point_maze", "options": {"start": "corner"} if corner else {}},
         "policy": {"hidden": [8, 8]},
-        "search": {
-            "algorithm": "map_elites",
-            "batch": 64,
-            "iso_sigma": 0.2,
-            "elites": {"kind": name},
-        },
+        "search": {"algorithm": "map_elites", "batch": 64, "iso_sigma": 0.2, "elites": {"kind": name}},
         "map": {"cells": [10, 10], "correct_every": correct, "correct_episodes": episodes},
         "budget": {"generations": generations},
         "compute": {"engine": "inline", "workers": 1, "inline_workers": workers},

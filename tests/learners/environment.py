@@ -33,13 +33,7 @@ class Environment:
 
 ENVIRONMENTS = {
     "learners": Environment(
-        {
-            "sbx-rl": "0.28.0",
-            "stable-baselines3": "2.9.2",
-            "torch": "2.13.0",
-            "torchrl": "0.14.1",
-            "evotorch": "0.6.1",
-        }
+        {"sbx-rl": "0.28.0", "stable-baselines3": "2.9.2", "torch": "2.13.0", "torchrl": "0.14.1", "evotorch": "0.6.1"}
     ),
     # One of the requirements of evorl-jax, a tracker of experiments, cannot be built.
     "qdax": Environment(

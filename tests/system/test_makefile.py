@@ -70,18 +70,8 @@ def uv(tmp_path_factory):
     if found := shutil.which("uv"):
         return found
     folder = tmp_path_factory.mktemp("uv")
-    install = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--disable-pip-version-check",
-        "--target",
-        folder,
-        "uv",
-    ]
-    done = subprocess.run(install, capture_output=True, text=True, check=False)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    done = subprocess.run([*pip, "--target", folder, "uv"], capture_output=True, text=True, check=False)
     if done.returncode:
         pytest.skip(f"uv cannot be installed: {done.stderr.strip().splitlines()[-1]}")
     return str(folder / "bin" / "uv")

@@ -50,19 +50,8 @@ def test_a_user_s_task(tmp_path, run):
 def test_one_of_brax_s(tmp_path, run):
     """Begun by a worker process, and gone on with in this one, which computes the whole, too."""
     task, inline = "brax:inverted_pendulum", ["compute.engine=inline", "compute.workers=1"]
-    run(
-        task,
-        "run",
-        "my.yaml",
-        "--engine",
-        "inline",
-        "--workers",
-        1,
-        "--out",
-        "resumed",
-        "--set",
-        "budget.generations=1",
-    )
+    start = ("run", "my.yaml", "--engine", "inline", "--workers", 1)
+    run(task, *start, "--out", "resumed", "--set", "budget.generations=1")
     with workers_in_this_process():
         api.run(api.load_config(config_of(task), inline), tmp_path / "whole")
         api.resume(tmp_path / "resumed", ["budget.generations=3"])

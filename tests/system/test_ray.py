@@ -29,14 +29,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-CONFIG = SMALL | {
-    "compute": {
-        "engine": "ray",
-        "chunk_pairs": 4,
-        "gradient_block_pairs": 8,
-        "dispatch_log": True,
-    }
-}
+CONFIG = SMALL | {"compute": {"engine": "ray", "chunk_pairs": 4, "gradient_block_pairs": 8, "dispatch_log": True}}
 
 
 def sessions() -> set[Path]:
