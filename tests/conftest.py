@@ -62,6 +62,15 @@ def workers_here() -> Iterator[None]:
 
 
 @pytest.fixture
+def one_process() -> Iterator[None]:
+    """As `workers_here`, for one test: those of other tests of the file start processes."""
+    from tests.helpers import workers_in_this_process  # imports JAX
+
+    with workers_in_this_process():
+        yield
+
+
+@pytest.fixture
 def small_disk(tmp_path):
     """A file system of one megabyte of its own; remount it to make it larger."""
     disk = tmp_path / "disk"

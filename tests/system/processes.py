@@ -74,7 +74,7 @@ def children() -> list[int]:
     return sorted(found)
 
 
-def is_running(pid: str) -> bool:
+def is_running(pid: int | str) -> bool:
     """Whether a process exists and is more than a zombie that nobody has reaped."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

@@ -47,13 +47,6 @@ def bits(result) -> list[bytes]:
     return [getattr(result, name).tobytes() for name in FIELDS]
 
 
-@pytest.fixture
-def here():
-    """Evaluators and runs start no process."""
-    with workers_in_this_process():
-        yield
-
-
 @pytest.fixture(scope="module")
 def reference():
     """Bits of two generations of the policies, three episodes each, on one worker."""
@@ -72,15 +65,7 @@ def twice(evaluate) -> list[list[bytes]]:
     return [bits(evaluate(POLICIES, episodes=3, seed=7, generation=generation)) for generation in (0, 1)]
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        {"workers": 2},
-        {"workers": 3},
-        {"engine": "inline", "workers": "auto"},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("where", [{"workers": 2}, {"workers": 3}, {"engine": "inline", "workers": "auto"}], ids=str)
 def test_bits_are_the_same_with_any_workers_and_engine(reference, where):
     before = children()
     with es_service.evaluator(CONFIG, **where) as evaluate:
@@ -174,7 +159,7 @@ with es_service.evaluator(CONFIG, workers="auto", address=sys.argv[1]) as evalua
     assert lost
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("one_process")
 def test_results_have_the_shapes_and_meaning_that_are_documented():
     with es_service.evaluator(CONFIG) as evaluate:
         assert evaluate.parameters == D
@@ -201,7 +186,7 @@ def test_results_have_the_shapes_and_meaning_that_are_documented():
         )
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("one_process")
 def test_initial_policies_are_those_of_a_run(tmp_path):
     """Generation 1 updates centre 0 alone."""
     choice = {"search.algorithm": "nsr_es", "search.centres": 2, "search.centre_choice": "round_robin"}
@@ -256,7 +241,7 @@ def one_evaluator():
         yield evaluate
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("one_process")
 def test_a_config_needs_no_search_and_no_budget_and_is_checked_nevertheless(reference):
     bare = {name: section for name, section in CONFIG.items() if name not in ("search", "budget")}
     for config in (bare, bare | {"search": {"pairs": 32}, "budget": {"env_steps": 9}, "map": {"enabled": False}}):

@@ -17,9 +17,9 @@ from es_service.store.reader import read_generation
 from tests.helpers import workers_in_this_process
 from tests.system import cluster
 from tests.system.cluster import Cluster
+from tests.system.processes import is_running
 from tests.system.session import finish
 from tests.system.test_cluster import memory_in_use
-from tests.workers.test_host import has_ended
 
 PROGRAM = Path(sys.executable).parent / "es-service"
 MODULE = "tests.workers.host_tasks"
@@ -134,7 +134,7 @@ def test_a_simulator_that_fails_once_on_a_cluster_of_hosts_changes_no_bit(tmp_pa
             assert not fault.exists(), f"no environment has met the fault {kind}"
             assert re.search(said, printed), printed
             if kind == "hang":
-                assert has_ended(Path(f"{fault}_process").read_text()), "what it has started ends with it"
+                assert not is_running(Path(f"{fault}_process").read_text()), "what it has started ends with it"
         session(6, "resume", run)
     assert digest_parts(run) == digest_parts(undisturbed)
 

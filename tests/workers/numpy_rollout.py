@@ -1,6 +1,7 @@
 """A rollout that the service does not ship: PointMaze in Python and NumPy, one episode after another, without JAX.
 
-`REGISTERING` is the content of a `sitecustomize.py` with which every new process has it, and no JAX.
+`NO_JAX` is the content of a `sitecustomize.py` with which no new process has JAX; with `REGISTERING` each has this
+rollout, too.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from workers.policies.outputs import action, drawn_action
 from workers.policies.policy import act, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
-REGISTERING = """
+NO_JAX = """
 import sys
 
 class NoJax:
@@ -30,6 +31,8 @@ class NoJax:
             raise ImportError(f"{name} is not needed")
 
 sys.meta_path.insert(0, NoJax())
+"""
+REGISTERING = f"""{NO_JAX}
 from tests.workers.numpy_rollout import NumPy
 from workers.rollouts import BACKENDS
 BACKENDS["numpy"] = NumPy()

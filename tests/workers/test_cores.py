@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import spec
-from tests.system.processes import ROOT
+from tests.system.processes import ROOT, is_running
 from tests.workers.test_worker import bits, work
 from workers import cores as module
 from workers.compilable import Compilable
@@ -134,12 +134,4 @@ def test_a_worker_and_its_child_processes_end_together(tmp_path, how, code):
     assert (b"a child process of this worker has ended" in done.stderr) == (how == "lose")
     children = [int(word) for word in done.stdout.split()]
     assert len(children) == 2
-    assert not any(is_running(pid) for pid in children)
-
-
-def is_running(pid):
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    assert not any(map(is_running, children))

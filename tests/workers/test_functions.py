@@ -23,7 +23,6 @@ from es_service.runs.export import arrays, tables
 from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, spec, workers_in_this_process
 from tests.workers import functions
-from tests.workers.test_host import NO_JAX
 from workers.environments import TaskError, describe_environment
 from workers.host.caller import Caller
 from workers.worker import make_worker
@@ -42,21 +41,6 @@ def config_of(name, search=ES, generations=3, **compute):
         "budget": {"generations": generations},
         "compute": {"engine": "inline", "workers": 1} | compute,
     }
-
-
-@pytest.fixture
-def no_jax(tmp_path, monkeypatch):
-    """No new process can import JAX."""
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
-    monkeypatch.syspath_prepend(tmp_path / "site")
-
-
-@pytest.fixture
-def one_process():
-    """The run of a test starts no process, while those of other tests do."""
-    with workers_in_this_process():
-        yield
 
 
 def test_a_function_says_what_it_is():

@@ -15,7 +15,7 @@ from es_service.protocol.noise import evaluation_reset_keys
 from es_service.protocol.sources import user_path, user_sources
 from es_service.runs.replay import record
 from es_service.runs.snapshot import Policy
-from tests.helpers import centre, random_parameters, spec, workers_in_this_process
+from tests.helpers import centre, random_parameters, spec
 from workers.environments import TaskError, describe_environment
 from workers.worker import make_worker
 
@@ -42,13 +42,6 @@ def config_of(environment, **task):
         "budget": {"generations": 2},
         "compute": {"engine": "inline", "workers": 1},
     }
-
-
-@pytest.fixture
-def one_process():
-    """The run of a test starts no process."""
-    with workers_in_this_process():
-        yield
 
 
 @pytest.mark.parametrize("name", CLASSIC)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.replay import record
 from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
+from tests.system.processes import is_running
 from tests.workers import host_tasks
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.host.episodes import Lanes
@@ -27,16 +27,6 @@ from workers.worker import make_worker
 
 MODULE = "tests.workers.host_tasks"
 MAZE, DRIFT = f"python:{MODULE}:CornerMaze", f"python:{MODULE}:Drift"
-NO_JAX = """
-import sys
-
-class NoJax:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("jax", "jaxlib", "brax", "llvmlite"):
-            raise ImportError(f"{name} is not needed")
-
-sys.meta_path.insert(0, NoJax())
-"""
 ES = {"algorithm": "es", "pairs": 16, "sigma": 0.1, "evaluation_episodes": 3}
 MAP_ELITES = {"algorithm": "map_elites", "batch": 20, "centres": 3, "iso_sigma": 0.2}
 
@@ -50,21 +40,6 @@ def config_of(environment, search=ES, **compute):
         "budget": {"generations": 4},
         "compute": {"engine": "inline", "workers": 2} | compute,
     }
-
-
-@pytest.fixture
-def no_jax(tmp_path, monkeypatch):
-    """No new process can import JAX."""
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
-    monkeypatch.syspath_prepend(tmp_path / "site")
-
-
-@pytest.fixture
-def one_process():
-    """The run of a test starts no process."""
-    with workers_in_this_process():
-        yield
 
 
 @pytest.mark.slow
@@ -211,14 +186,6 @@ def test_outputs_of_steps_are_what_happened_in_training_and_in_evaluations(episo
         make_worker(drift(outputs=("nothing",)))([(centre_of(worker_spec), EvaluationChunk(1, 0))])
 
 
-def has_ended(process):
-    """Whether a process is gone, or has ended and is not waited for."""
-    try:
-        return Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_jax")
 @pytest.mark.parametrize(
@@ -252,7 +219,7 @@ def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch)
     assert (lost, len(notices)) == (0, 0) if fault == "it raises this once" else (1, 1), notices
     if fault == "hang":
         assert "within 1 s of computing (task.time_limit_s)" in notices[0]
-        assert has_ended((tmp_path / "fault_process").read_text()), "what it has started ends with it"
+        assert not is_running((tmp_path / "fault_process").read_text()), "what it has started ends with it"
     assert run.digest() == undisturbed
 
 
