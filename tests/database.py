@@ -14,3 +14,9 @@ def database(file: Path) -> Iterator[sqlite3.Connection]:
     which a connection of SQLite is not by its own `with`."""
     with closing(sqlite3.connect(file)) as connection, connection:
         yield connection
+
+
+def execute(folder: Path, statement: str, *values: object) -> list[tuple]:
+    """The rows that a statement on a run's database gives."""
+    with database(folder / "run.db") as connection:
+        return connection.execute(statement, values).fetchall()

@@ -12,7 +12,7 @@ from es_service.store.digest import arrays_sha256, checked_parts, digest_at, dig
 from es_service.store.reader import read_generation
 from es_service.store.tables import table_bytes
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import database, execute
 from tests.es_service.store_examples import (
     COLUMNS,
     EVALUATION_COLUMNS,
@@ -87,8 +87,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
             }
             store.commit(generation, parts, history_row(generation), evaluated_table(generation))
     assert digest(tmp_path / "other") == expected
-    with database(tmp_path / "other" / "run.db") as connection:
-        connection.execute("VACUUM")
+    execute(tmp_path / "other", "VACUUM")
     assert digest(tmp_path / "other") == expected
 
 

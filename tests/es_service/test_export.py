@@ -11,7 +11,7 @@ from es_service import api
 from es_service.errors import StoreError
 from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
-from tests.database import database
+from tests.database import execute
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 FIRST, LAST = 2, 8
@@ -66,8 +66,7 @@ def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_
 
 
 def test_a_run_that_lost_its_newest_history_row_is_not_exported_as_of_the_generation_before(run, tmp_path):
-    with database(run.folder / "run.db") as connection:
-        connection.execute("DELETE FROM history WHERE generation = ?", (run.generation,))
+    execute(run.folder, "DELETE FROM history WHERE generation = ?", run.generation)
     for use in (lambda: export(run, "csv", tmp_path), lambda: list(tables(run)), lambda: arrays(run)):
         with pytest.raises(StoreError, match=f"the history after generation {FIRST - 1} is missing"):
             use()

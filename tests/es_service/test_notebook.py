@@ -7,7 +7,7 @@ from es_service import open_run
 from es_service.report.data import read_run
 from es_service.report.facts import verdict
 from es_service.report.maps import draw_map
-from tests.database import database
+from tests.database import execute
 from tests.es_service.test_report_page import Elements
 from tests.run_examples import write_run
 
@@ -33,9 +33,8 @@ def test_a_run_without_a_map_or_a_generation_is_shown(tmp_path):
     page = page_of(write_run(tmp_path / "a", {"map.enabled": False, "search.algorithm": "es"}))
     assert re.findall("<figcaption><b>([^<]*)", page) == ["Fitness"]
     folder = write_run(tmp_path / "b")
-    with database(folder / "run.db") as connection:
-        connection.execute("DELETE FROM history")
-        connection.execute("DELETE FROM state")
+    execute(folder, "DELETE FROM history")
+    execute(folder, "DELETE FROM state")
     assert "No generation is finished yet" in page_of(folder)
 
 

@@ -11,7 +11,7 @@ from es_service import api
 from es_service.errors import StoreError
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
-from tests.database import database
+from tests.database import execute
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -122,9 +122,7 @@ def test_they_cannot_be_changed_in_place_also_after_a_resume(tmp_path):
 def test_a_part_that_nothing_changes_is_written_once(tmp_path):
     folder = begin(tmp_path / "run", "idle").folder
     api.resume(folder, ["budget.generations=8"])
-    with database(folder / "run.db") as connection:
-        written = connection.execute("SELECT generation FROM state WHERE part = 'own'").fetchall()
-    assert written == [(0,)]
+    assert execute(folder, "SELECT generation FROM state WHERE part = 'own'") == [(0,)]
 
 
 def idle(config):
@@ -136,38 +134,30 @@ def from_generation_2(extra, evaluation, **changes):
 
 
 OWN = {"x": np.zeros(2), "n": np.array(1)}
-CHANGES = {
-    "other_type": lambda extra, told: from_generation_2(extra, told, x=np.zeros(2, np.float32)),
-    "another": lambda extra, told: from_generation_2(extra, told, y=np.zeros(2)),
-    "fewer": lambda extra, told: {"x": extra["x"]} if told.generation == 2 else extra,
-    "no_array": lambda extra, told: from_generation_2(extra, told, x=[0.0, 0.0]),
-    "later_objects": lambda extra, told: from_generation_2(extra, told, x=np.array([None, 0.0])),
-    "longer": lambda extra, told: from_generation_2(extra, told, x=np.zeros((3, 4))),
-}
 
 
 def other_type(config):
-    return telling(config, OWN, CHANGES["other_type"])
+    return telling(config, OWN, lambda extra, told: from_generation_2(extra, told, x=np.zeros(2, np.float32)))
 
 
 def another(config):
-    return telling(config, OWN, CHANGES["another"])
+    return telling(config, OWN, lambda extra, told: from_generation_2(extra, told, y=np.zeros(2)))
 
 
 def fewer(config):
-    return telling(config, OWN, CHANGES["fewer"])
+    return telling(config, OWN, lambda extra, told: {"x": extra["x"]} if told.generation == 2 else extra)
 
 
 def no_array(config):
-    return telling(config, OWN, CHANGES["no_array"])
+    return telling(config, OWN, lambda extra, told: from_generation_2(extra, told, x=[0.0, 0.0]))
 
 
 def later_objects(config):
-    return telling(config, OWN, CHANGES["later_objects"])
+    return telling(config, OWN, lambda extra, told: from_generation_2(extra, told, x=np.array([None, 0.0])))
 
 
 def longer(config):
-    return telling(config, OWN, CHANGES["longer"])
+    return telling(config, OWN, lambda extra, told: from_generation_2(extra, told, x=np.zeros((3, 4))))
 
 
 @pytest.mark.parametrize("name", ["other_type", "another", "fewer", "longer"])

@@ -18,7 +18,7 @@ from es_service.report.facts import number
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
-from tests.database import database
+from tests.database import execute
 from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
 
@@ -173,8 +173,7 @@ def test_a_common_target_is_the_threshold(tmp_path):
 
 
 def test_a_run_without_generations_is_refused(runs, tmp_path):
-    with database(write_run(tmp_path / "run") / "run.db") as connection:
-        connection.execute("DELETE FROM history")
+    execute(write_run(tmp_path / "run"), "DELETE FROM history")
     with pytest.raises(NotInRunError, match="has no finished generation yet"):
         comparison_page([runs[0], read_run(tmp_path / "run")])
 
@@ -219,8 +218,7 @@ def test_all_text_of_a_user_is_escaped(tmp_path):
     pages = []
     for name, value in ((EVIL, f"v{EVIL}"), ("", "b")):
         folders = named_runs(tmp_path / str(len(name)), name, value)
-        with database(folders[0] / "run.db") as connection:
-            connection.execute("DELETE FROM history WHERE generation = 7")
+        execute(folders[0], "DELETE FROM history WHERE generation = 7")
         pages.append(comparison_page([read_run(folder) for folder in folders], ["task.options.way"]))
     page, plain = pages
     found = Elements(page)

@@ -22,7 +22,7 @@ from es_service.report.data import read_run
 from es_service.report.markup import Frame, Markup, data_script, tag, tick_text, ticks
 from es_service.report.page import run_page
 from es_service.report.write import python_call, write_report
-from tests.database import database
+from tests.database import execute
 from tests.run_examples import write_run
 from workers.environments import SHIPPED
 
@@ -189,16 +189,14 @@ def test_generation_0_alone_and_a_run_without_a_map_have_pages(tmp_path, setting
 
 def test_a_run_before_its_first_generation_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run")
-    with database(folder / "run.db") as connection:
-        connection.execute("DELETE FROM history")
-        connection.execute("DELETE FROM state")
+    execute(folder, "DELETE FROM history")
+    execute(folder, "DELETE FROM state")
     assert "No generation is finished yet" in page_of(folder)
 
 
 def test_a_damaged_run_says_so(tmp_path):
     folder = write_run(tmp_path / "run")
-    with database(folder / "run.db") as connection:
-        connection.execute("UPDATE history SET best_fitness = 5 WHERE generation = 7")
+    execute(folder, "UPDATE history SET best_fitness = 5 WHERE generation = 7")
     assert "the history rows of generations 7 are damaged or missing" in page_of(folder)
 
 

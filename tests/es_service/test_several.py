@@ -19,7 +19,7 @@ from es_service.runs.folders import runs_of
 from es_service.runs.run_status import newest_runs
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
-from tests.database import database
+from tests.database import execute
 from tests.run_examples import write_run
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -129,8 +129,7 @@ def test_the_report_of_a_sweep_compares_its_runs_in_its_folder(sweep, tmp_path):
 
     damage(sweep / "seed=2")
     begun = write_run(tmp_path / "begun")
-    with database(begun / "run.db") as connection:
-        connection.execute("DELETE FROM history")
+    execute(begun, "DELETE FROM history")
     code, printed, notes = es("report", sweep, begun, "--out", tmp_path / "page.html")
     assert (code, printed) == (1, f"{tmp_path}/page.html\n")
     assert f"error: {sweep}/seed=2 " in notes

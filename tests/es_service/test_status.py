@@ -27,7 +27,7 @@ from es_service.runs import recent
 from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
-from tests.database import database
+from tests.database import execute
 from tests.run_examples import write_run
 from tests.system.session import SMALL
 
@@ -110,8 +110,7 @@ def test_a_damaged_row_hides_only_what_is_read_from_it(console, tmp_path, capsys
     run = api.open_run(write_run(tmp_path / "run", generations=10))
     print_status(console, run)
     whole = capsys.readouterr().out.splitlines()
-    with database(run.folder / "run.db") as connection:
-        connection.execute("UPDATE history SET sha256 = x'00' WHERE generation = 4")
+    execute(run.folder, "UPDATE history SET sha256 = x'00' WHERE generation = 4")
     problem = f"{run.folder} cannot be read: the history row of generation 4 is damaged or missing"
     gone = f"not known          objectives and faults of the recent generations: {problem}"
     print_status(console, run)

@@ -22,7 +22,7 @@ from es_service.store.reader import (
     read_platforms,
 )
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import execute
 from tests.es_service.store_examples import (
     COLUMNS,
     CONFIG_YAML,
@@ -39,12 +39,6 @@ from tests.es_service.store_examples import (
     state_at,
     without_root_rights,
 )
-
-
-def rows(folder, query):
-    with database(folder / "run.db") as connection:
-        return connection.execute(query).fetchall()
-
 
 # Creating
 
@@ -188,7 +182,7 @@ def test_the_state_of_the_last_two_generations_is_kept_and_no_more(tmp_path):
     with create(folder) as run:
         for generation in range(12):
             advance(run, generation)
-            kept = rows(folder, "SELECT part, generation FROM state")
+            kept = execute(folder, "SELECT part, generation FROM state")
             for part in {name for at in range(generation + 1) for name in parts_of(at)}:
                 written = [at for at in range(generation + 1) if part in parts_of(at)]
                 until_before = [at for at in written if at <= generation - 1]

@@ -24,7 +24,7 @@ from es_service.store.reader import (
 )
 from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import database, execute
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,
@@ -148,19 +148,12 @@ def test_a_copy_of_damaged_content_does_not_replace_a_good_one(tmp_path, monkeyp
 
 def test_a_state_row_that_vanished_is_not_replaced_by_an_older_one(tmp_path):
     folder = finished(tmp_path / "run", 6)
-    with database(folder / "run.db") as connection:
-        connection.execute("DELETE FROM state WHERE part = 'observations' AND generation = 5")
+    execute(folder, "DELETE FROM state WHERE part = 'observations' AND generation = 5")
     with pytest.raises(StoreError, match="state of generation 5 is damaged"):
         read_parts(folder)
     with RunStore.open(folder) as run:
         assert run.generation == 4
         assert "fell back" in run.notices[0]
-
-
-def behind_the_stores_back(folder, *statements):
-    with database(folder / "run.db") as connection:
-        for statement in statements:
-            connection.execute(statement)
 
 
 def kept_run(folder, last, every=4):
@@ -173,7 +166,7 @@ def kept_run(folder, last, every=4):
 
 def damage_states(folder, generations):
     """Make the newest states unusable: a part that changes in every generation."""
-    behind_the_stores_back(
+    execute(
         folder, f"UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation IN {(*generations, -1)}"
     )
 
@@ -202,7 +195,7 @@ def test_with_the_last_two_states_damaged_the_run_falls_back_to_the_newest_kept_
 def test_a_damaged_history_row_falls_back_to_the_newest_kept_state_before_it(tmp_path):
     folder = kept_run(tmp_path / "run", 11)
     uninterrupted = digest(folder)
-    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
+    execute(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
     with RunStore.open(folder) as run:
         assert "fell back to generation 4" in run.notices[0]
         run.keep_every = 4
@@ -216,7 +209,7 @@ def test_a_database_of_which_more_than_a_generation_would_be_deleted_is_kept(tmp
     with create(tmp_path / "run") as run:
         run.keep_every = 10
         advance(run, 59)
-        behind_the_stores_back(tmp_path / "run", "UPDATE history SET sha256 = x'00' WHERE generation = 12")
+        execute(tmp_path / "run", "UPDATE history SET sha256 = x'00' WHERE generation = 12")
         shutil.copytree(tmp_path / "run", folder)
     dump = _content(folder / "run.db")
     for _ in ("first", "again, when an earlier one is in its place"):
@@ -236,7 +229,7 @@ def test_a_database_of_which_more_than_a_generation_would_be_deleted_is_kept(tmp
 
 def test_a_database_that_cannot_be_kept_loses_no_generation(tmp_path, monkeypatch):
     folder = kept_run(tmp_path / "run", 11)
-    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
+    execute(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
     before = _content(folder / "run.db")
 
     def is_full(path):
@@ -283,7 +276,7 @@ def test_what_loses_fewer_generations_is_taken_a_kept_state_or_the_copy(tmp_path
 
 def test_a_history_row_that_vanished_is_noticed(tmp_path):
     folder = finished(tmp_path / "run", 6)
-    behind_the_stores_back(folder, "DELETE FROM history WHERE generation = 2")
+    execute(folder, "DELETE FROM history WHERE generation = 2")
     for use in (RunStore.open, read_history):
         with pytest.raises(StoreError, match=r"history row of generation 2 is (damaged or )?missing"):
             use(folder)
@@ -292,7 +285,7 @@ def test_a_history_row_that_vanished_is_noticed(tmp_path):
 def test_the_newest_history_row_that_vanished_is_noticed(tmp_path):
     """Without it, the rest looks like a run that ended one generation earlier."""
     folder = finished(tmp_path / "run", 6)
-    behind_the_stores_back(folder, "DELETE FROM history WHERE generation = 5")
+    execute(folder, "DELETE FROM history WHERE generation = 5")
     for read in (read_generation, read_history, read_evaluations, read_parts):
         with pytest.raises(
             StoreError, match="history after generation 4 is missing; the state is that of generation 5"
@@ -310,7 +303,7 @@ def test_the_newest_history_row_that_vanished_is_noticed(tmp_path):
 def test_other_tables_and_columns_are_noticed(tmp_path):
     for statement in ("ALTER TABLE history RENAME COLUMN goal_distance TO other", "CREATE TABLE other (a)"):
         folder = finished(tmp_path / statement[:5], 3)
-        behind_the_stores_back(folder, statement)
+        execute(folder, statement)
         with pytest.raises(StoreError, match="its tables are not those of a run"):
             RunStore.open(folder)
     with pytest.raises(StoreError, match="no such column"):
@@ -334,11 +327,11 @@ def test_another_platform_or_meta_is_noticed(tmp_path):
     with create(tmp_path / "run") as run:
         run.record_platform(0, {"cpu": "a"})
         advance(run, 2)
-    behind_the_stores_back(tmp_path / "run", """UPDATE platform SET platform = '{"cpu": "b"}'""")
+    execute(tmp_path / "run", """UPDATE platform SET platform = '{"cpu": "b"}'""")
     for use in (RunStore.open, read_platforms):
         with pytest.raises(StoreError, match="platform recorded at generation 0 does not match"):
             use(tmp_path / "run")
-    behind_the_stores_back(tmp_path / "run", "UPDATE meta SET value = replace(value, '0', '1') WHERE key = 'run'")
+    execute(tmp_path / "run", "UPDATE meta SET value = replace(value, '0', '1') WHERE key = 'run'")
     with pytest.raises(StoreError, match="record 'run' in its table meta does not match"):
         read_history(tmp_path / "run")
 
@@ -356,7 +349,7 @@ def test_a_platform_that_vanished_is_noticed(tmp_path):
             run.record_platform(2, {"cpu": "c"})
             advance(run, 3)
         assert read_platforms(folder) == [(0, {"cpu": "a"}), (2, {"cpu": "c"})]
-        behind_the_stores_back(folder, f"DELETE FROM platform WHERE generation = {first}")
+        execute(folder, f"DELETE FROM platform WHERE generation = {first}")
         for use in (RunStore.open, read_platforms):
             with pytest.raises(StoreError, match=f"platform recorded at generation {first} is missing"):
                 use(folder)
@@ -370,7 +363,7 @@ def test_a_platform_is_lost_together_with_its_only_generation(tmp_path):
     with RunStore.open(folder) as run:
         run.record_platform(5, {"cpu": "b"})
         advance(run, 5)
-    behind_the_stores_back(folder, "DELETE FROM state WHERE generation = 5")
+    execute(folder, "DELETE FROM state WHERE generation = 5")
     with RunStore.open(folder) as run:
         assert run.generation == 4
         assert read_platforms(folder) == [(0, {"cpu": "a"})]
@@ -402,16 +395,16 @@ def test_platforms_that_an_older_version_recorded_or_replaced_are_read(tmp_path,
         work(5, "c", 5)
     work(6, "d", 6)
     assert [[at for at, _ in found] for found in platforms] == [[0], [0], [0, 3], [0], [0, 5], [0, 5, 6]]
-    behind_the_stores_back(folder, "DELETE FROM platform WHERE generation = 5")
+    execute(folder, "DELETE FROM platform WHERE generation = 5")
     with pytest.raises(StoreError, match="platform recorded at generation 5 is missing"):
         read_platforms(folder)
 
 
 def test_the_newest_generation_is_read_from_its_sound_row(tmp_path):
     folder = finished(tmp_path / "run", 6)
-    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 2")
+    execute(folder, "UPDATE history SET env_steps = 1 WHERE generation = 2")
     assert read_generation(folder) == 5
-    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 5")
+    execute(folder, "UPDATE history SET env_steps = 1 WHERE generation = 5")
     with pytest.raises(StoreError, match="history row of generation 5"):
         read_generation(folder)
 
@@ -422,7 +415,7 @@ def test_a_row_of_a_negative_generation_is_noticed(tmp_path):
     copied = (
         "SELECT -1, env_steps, centre_fitness_mean, goal_distance, seconds_rollout, evaluations, state_sha256, sha256"
     )
-    behind_the_stores_back(folder, f"INSERT INTO history {copied} FROM history WHERE generation = 0")
+    execute(folder, f"INSERT INTO history {copied} FROM history WHERE generation = 0")
     for use in (RunStore.open, checked_parts):
         with pytest.raises(StoreError, match="history row of a negative generation"):
             use(folder)
@@ -430,7 +423,7 @@ def test_a_row_of_a_negative_generation_is_noticed(tmp_path):
 
 def test_many_problems_are_not_all_named(tmp_path):
     folder = finished(tmp_path / "run", 30)
-    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation < 20")
+    execute(folder, "UPDATE history SET env_steps = 1 WHERE generation < 20")
     with pytest.raises(StoreError, match=r"generation 7 does not match its SHA-256; and 13 more problems\."):
         RunStore.open(folder)
 

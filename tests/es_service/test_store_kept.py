@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from es_service.errors import StoreError
 from es_service.store.reader import read_kept, read_parts
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import execute
 from tests.es_service.store_examples import advance, assert_same_state, assert_sound, create, digest, finished, state_at
 
 
@@ -73,8 +73,7 @@ def test_a_damaged_kept_state_is_told_and_the_run_goes_on(tmp_path):
     with create(tmp_path / "run") as store:
         store.keep_every = 4
         advance(store, 10)
-    with database(tmp_path / "run/run.db") as connection:
-        connection.execute("UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation = 4")
+    execute(tmp_path / "run", "UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation = 4")
     with RunStore.open(tmp_path / "run") as store:
         (notice,) = store.notices
         assert "state of 'observations' at generation 4 does not match its SHA-256" in notice

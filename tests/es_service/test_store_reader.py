@@ -22,7 +22,7 @@ from es_service.store.reader import (
     read_platforms,
 )
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import execute
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,
@@ -73,8 +73,7 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run.db").write_bytes(content)
     (tmp_path / "foreign").mkdir()
-    with database(tmp_path / "foreign" / "run.db") as connection:
-        connection.execute("CREATE TABLE a (b)")
+    execute(tmp_path / "foreign", "CREATE TABLE a (b)")
     for name in ("file", "other", "missing", "text", "empty", "foreign"):
         for use in (RunStore.open, read_meta, read_history, read_parts):
             with pytest.raises(StoreError, match="not a run folder"):
@@ -133,8 +132,7 @@ def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkey
 def test_history_that_ends_before_the_state_is_noticed(tmp_path):
     """Damage to a page can make SQLite see fewer rows without an error."""
     folder = finished(tmp_path / "run", 6)
-    with database(folder / "run.db") as connection:
-        connection.execute("DELETE FROM history WHERE generation >= 4")
+    execute(folder, "DELETE FROM history WHERE generation >= 4")
     for since in (None, 3, 4):
         with pytest.raises(StoreError, match="the history after generation 3 is missing"):
             read_history(folder, since)
@@ -147,11 +145,9 @@ def test_the_newest_row_is_checked_alone(tmp_path):
     """What says where a run stands must not take the longer the longer it has been running."""
     folder = finished(tmp_path / "run", 6)
     for generation, problem in ((2, None), (5, "the history row of generation 5 is damaged")):
-        with database(folder / "run.db") as connection:
-            connection.execute("UPDATE history SET seconds_rollout = 99 WHERE generation = ?", (generation,))
+        execute(folder, "UPDATE history SET seconds_rollout = 99 WHERE generation = ?", generation)
         with pytest.raises(StoreError, match=problem) if problem else contextlib.nullcontext():
             read_newest(folder)
-    with database(folder / "run.db") as connection:
-        connection.execute("DELETE FROM history WHERE generation = 5")
+    execute(folder, "DELETE FROM history WHERE generation = 5")
     with pytest.raises(StoreError, match="the history after generation 4 is missing"):
         read_newest(folder)

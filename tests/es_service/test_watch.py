@@ -25,7 +25,7 @@ from es_service.watch import channels
 from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
 from es_service.watch.server import Site
-from tests.database import database
+from tests.database import database, execute
 from tests.es_service.test_report_page import Elements
 from tests.helpers import workers_in_this_process
 from tests.run_examples import write_run
@@ -394,8 +394,7 @@ def test_the_command_refuses_files_and_ports_in_use(tmp_path):
 def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
     monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 3)
     folder = write_run(tmp_path / "a", generations=20)
-    with database(folder / "run.db") as connection:
-        connection.execute("UPDATE history SET sha256 = '' WHERE generation BETWEEN 5 AND 9")
+    execute(folder, "UPDATE history SET sha256 = '' WHERE generation BETWEEN 5 AND 9")
     reading = Reading(Runs([tmp_path]).find()[0])
     for _ in range(30):
         reading.update()

@@ -27,7 +27,7 @@ from es_service.runs.evaluation import FRESH_GENERATION
 from es_service.runs.intervals import mean_interval, share_interval
 from es_service.runs.view import open_run
 from es_service.store.writer import RunStore
-from tests.database import database
+from tests.database import database, execute
 from tests.helpers import DirectEvaluator
 
 CONFIG = {
@@ -176,8 +176,7 @@ def test_what_has_changed_since_is_named(finished, monkeypatch):
 def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
     run, _ = finished
     shutil.copytree(run.folder, tmp_path / "run")
-    file = tmp_path / "run" / "run.db"
-    with database(file) as connection:
+    with database(tmp_path / "run" / "run.db") as connection:
         [(payload,)] = connection.execute("SELECT payload FROM certification WHERE number = 1 AND rank = 1").fetchall()
         changed = bytes([*payload[:-1], payload[-1] ^ 1])
         connection.execute("UPDATE certification SET payload = ? WHERE number = 1 AND rank = 1", (changed,))
@@ -188,8 +187,7 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
         assert "row 1 of certification 1" in store.notices[0]
     assert len(damaged.certified) == 3
     assert damaged.digest() == run.digest()
-    with database(file) as connection:
-        connection.execute("UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
+    execute(tmp_path / "run", "UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
     with RunStore.open(tmp_path / "run") as store:
         assert store.next_certification == 2, "its episodes have been seen"
     again = certify_run(tmp_path / "run", top=5, episodes=40)
@@ -200,8 +198,7 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
 def test_another_policy_does_not_take_the_place_of_a_damaged_first(finished, tmp_path):
     run, _ = finished
     shutil.copytree(run.folder, tmp_path / "run")
-    with database(tmp_path / "run" / "run.db") as connection:
-        connection.execute("UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
+    execute(tmp_path / "run", "UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
     RunStore.open(tmp_path / "run").close()
     assert open_run(tmp_path / "run").certified[["certification", "rank"]].to_numpy().tolist() == [
         [0, 0],

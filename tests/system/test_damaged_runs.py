@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from es_service import api
-from tests.database import database
+from tests.database import execute
 from tests.es_service.mutations import damage_bytes, damage_rows
 from tests.es_service.test_store_fuzz import json_without_recent, status_without_recent
 from tests.system.command_line import command, digest
@@ -79,8 +79,7 @@ def test_resume_falls_back_to_a_kept_state_and_says_so(tmp_path):
     folder = tmp_path / "run"
     api.run(SMALL | {"budget": {"generations": 9}, "store": {"keep_every": 3}}, folder)
     uninterrupted = digest(folder)
-    with database(folder / "run.db") as connection:
-        connection.execute("UPDATE state SET payload = x'00' WHERE generation >= 8")
+    execute(folder, "UPDATE state SET payload = x'00' WHERE generation >= 8")
     result = command("resume", folder)
     assert result.returncode == 0, result.stderr
     assert "fell back to generation 6" in result.stderr

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from es_service.runs.view import open_run
-from tests.database import database
+from tests.database import execute
 from tests.run_examples import write_run
 from tests.system.browser import browser
 from tests.system.command_line import PROGRAM
@@ -150,8 +150,7 @@ def test_a_damaged_run_says_so_and_hides_no_other(page, tmp_path):
     for name in ("broken", "damaged", "whole"):
         write_run(tmp_path / name, generations=40)
     (tmp_path / "broken/run.db").write_bytes(b"nothing")
-    with database(tmp_path / "damaged/run.db") as connection:
-        connection.execute("UPDATE history SET centre_fitness_mean = 0 WHERE generation = 7")
+    execute(tmp_path / "damaged", "UPDATE history SET centre_fitness_mean = 0 WHERE generation = 7")
     with watching(tmp_path) as address:
         page.open(address)
         page.until("document.querySelectorAll('.runs tbody tr').length === 3")
