@@ -165,12 +165,8 @@ BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/lo
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
 ENGINE = "es_service/dispatch/engine.py"
-EPISODE, WORKER, RESULTS, POLICY = (
-    "workers/episode.py",
-    "workers/worker.py",
-    "workers/results.py",
-    "workers/policies/policy.py",
-)
+EPISODE, WORKER = "workers/episode.py", "workers/worker.py"
+RESULTS, POLICY = "workers/results.py", "workers/policies/policy.py"
 XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
 LOW_RANK = "es_service/protocol/low_rank.py"
@@ -351,12 +347,7 @@ CASES = [
         "the order of requeued items",
         OF_SCHEDULER,
         ("is reversed", SCHEDULER, "for slot in reversed(slots):", "for slot in slots:"),
-        (
-            "puts them last",
-            CHANGES,
-            "s.places[0][0] - 1 if s.places else 0",
-            "s.places[-1][0] + 1 if s.places else 0",
-        ),
+        ("puts them last", CHANGES, "s.places[0][0] - 1 if s.places else 0", "s.places[-1][0] + 1 if s.places else 0"),
     ),
     *cases(
         "the item that loses workers is charged where items overlap",
@@ -539,12 +530,7 @@ CASES = [
             "self.forget_oldest(self._most_bytes, spared=wanted)",
             "self.forget_oldest(self._most_bytes)",
         ),
-        (
-            "are made before what they are made of",
-            KEPT_PARENTS,
-            "return dict(reversed(steps.items()))",
-            "return steps",
-        ),
+        ("are made before what they are made of", KEPT_PARENTS, "return dict(reversed(steps.items()))", "return steps"),
     ),
     *cases(
         "an elite's fitness",
@@ -580,7 +566,7 @@ CASES = [
     ),
     *cases(
         "one key for all",
-        "tests/workers/test_policy.py",
+        "tests/workers/test_policy_kinds.py",
         (
             "layers",
             POLICY,
@@ -605,12 +591,7 @@ CASES = [
         "arrays that alias the simulator's memory",
         OF_ROLLOUT,
         ("descriptors of members", RESULTS, "x_P_S_E[:, :, 0].copy()", "x_P_S_E[:, :, 0]"),
-        (
-            "descriptors of episodes",
-            RESULTS,
-            "host = episodes.map(np.array)",
-            "host = episodes.map(np.asarray)",
-        ),
+        ("descriptors of episodes", RESULTS, "host = episodes.map(np.array)", "host = episodes.map(np.asarray)"),
         ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[first].copy()", "np.asarray(episodes.trace_T_B)[first]"),
     ),
     *cases(

@@ -57,16 +57,6 @@ def test_grids_equal_the_reference_on_any_descriptor_and_on_every_edge(sides, da
     assert grid.cells_of(descriptors).tolist() == expected
 
 
-def test_five_thousand_descriptors_equal_the_reference():
-    grid = Grid(((-35.0, 40.0), (-1.0, 0.1)), (20, 7))
-    descriptors = np.random.default_rng(0).uniform([-40, -1.2], [45, 0.3], (5000, 2))
-    expected = [
-        reference.cell_number(grid.shape, reference.grid_index(grid.bounds, grid.shape, d)) for d in descriptors
-    ]
-    assert grid.cells_of(descriptors).tolist() == expected
-    assert len(set(expected)) == grid.size
-
-
 def test_cells_are_numbered_with_the_last_dimension_fastest():
     assert [PLANE.index_of(cell) for cell in (0, 1, 3, 4, 11)] == [(0, 0), (0, 1), (0, 3), (1, 0), (2, 3)]
     assert all(PLANE.cell_at(PLANE.index_of(cell)) == cell for cell in range(PLANE.size))

@@ -36,7 +36,7 @@ def small_config(policy=None, **changes):
     return load_config(mapping)
 
 
-def run_in_memory(config, evaluator=None):
+def run_in_memory(config, evaluator=None, store=None):
     evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     first = initial_parameters(policy_spec(config, SHIPPED["point_maze"]), config.policy.init, config.seed)
     search = driver.Search(
@@ -45,6 +45,6 @@ def run_in_memory(config, evaluator=None):
         lambda: ([first], no_observations(2)),
         SHIPPED["point_maze"],
     )
-    store = MemoryStore()
+    store = store or MemoryStore()
     state, reason = driver.run(search, evaluator, store, None, lambda row: None)
     return state, store, evaluator, reason

@@ -1,6 +1,6 @@
 """MAP-Elites against its reference implementation.
 
-Also parents, variation, invalid policies, interruption, and what a config may say.
+Also parents, variation, invalid policies, and what a config may say.
 """
 
 from dataclasses import replace
@@ -11,7 +11,6 @@ import pytest
 from es_service.api import load_config
 from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.errors import ConfigError
-from es_service.loop.history import history_columns
 from es_service.loop.parts import elite_part
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
@@ -22,11 +21,9 @@ from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.map_elites import PARENT_CHOICE, parent_cells
 from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
-from es_service.store.codec import decode_part, encode_part
-from tests.laws.me_es_runs import CELLS, SHAPE, Remembering, Sharing, first_centres, number, run_in_memory
+from tests.laws.me_es_runs import CELLS, SHAPE, first_centres, number, run_in_memory
 from tests.references import map_elites as reference
 from tests.references.behaviour_map import GridMap
-from workers.environments import SHIPPED
 
 BATCH, CENTRES, ISO, LINE = 20, 3, 0.3, 0.6
 
@@ -209,30 +206,10 @@ def told(generation, centre, fitness, place, valid=True):
     return CentreEvaluation(generation, centre, valid, fitness, np.array([place]))
 
 
-# Interruption
-
-
-def test_a_search_put_together_again_equals_an_uninterrupted_one():
-    _, straight, _ = run_in_memory(config_of())
-    _, store, _ = run_in_memory(config_of(generations=5), store=Remembering())
-    store.parts = {name: decode_part(encode_part(part)) for name, part in store.parts.items()}
-    run_in_memory(config_of(), Sharing(), store)
-    assert {name: encode_part(part) for name, part in store.parts.items()} == {
-        name: encode_part(part) for name, part in straight.parts.items()
-    }
-    columns = [c.name for c in history_columns(SHIPPED["point_maze"], True) if c.deterministic]
-    kept = [[[row[name] for name in columns] for row in s.rows] for s in (store, straight)]
-    np.testing.assert_array_equal(np.array(kept[0], float), np.array(kept[1], float))
-
-
 # The config
 
 
-PLAIN = {
-    "task": {"environment": "point_maze"},
-    "search": {"algorithm": "map_elites"},
-    "budget": {"generations": 1},
-}
+PLAIN = {"task": {"environment": "point_maze"}, "search": {"algorithm": "map_elites"}, "budget": {"generations": 1}}
 
 
 @pytest.mark.parametrize("preset", ["literature", "uber"])

@@ -6,12 +6,10 @@ import pytest
 from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.config.parts import Ranks, Returns
-from es_service.loop import driver
 from es_service.loop.checks import invalidate
 from es_service.loop.parts import state_from_parts
-from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
-from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.common import (
     CENTRE_CHOICE,
@@ -24,11 +22,12 @@ from es_service.search.algorithms.nsra_es import adapted_weight
 from es_service.search.objectives import utilities, weighted
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
+from tests.laws import me_es_runs
+from tests.laws.me_es_runs import SHAPE
 from tests.references import novelty_search as reference
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 
-SHAPE = PolicySpec((2, 8, 8, 2))
 RULE = {"fitness_weight_start": 0.6, "fitness_weight_step": 0.15, "fitness_weight_patience": 2}
 STARTS = {"es": 1.0, "ns_es": 0.0, "nsr_es": 0.5, "nsra_es": 0.6}
 
@@ -56,16 +55,7 @@ def config_of(algorithm, distance="euclidean", **search):
 
 def run_in_memory(config, evaluator=None, store=None):
     evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    centres = [initial_parameters(SHAPE, config.policy.init, config.seed, m) for m in range(config.search.centres)]
-    search = driver.Search(
-        config,
-        ALGORITHMS[config.search.algorithm](config),
-        lambda: (centres, no_observations(2)),
-        SHIPPED["point_maze"],
-    )
-    store = store or MemoryStore()
-    state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
-    return state, store, evaluator
+    return me_es_runs.run_in_memory(config, evaluator, store)
 
 
 def episodes(evaluator, kind, generation, centre_D=None):

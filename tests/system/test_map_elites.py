@@ -1,16 +1,12 @@
-"""MAP-Elites from the outside: placement, kills, a fork of another task, and what the command line says of it."""
+"""MAP-Elites from the outside: a fork of another task, and what the command line says of it."""
 
 from __future__ import annotations
-
-import signal
 
 import pytest
 
 from es_service import api
-from es_service.store.digest import digest_parts
 from tests.system.command_line import command
-from tests.system.processes import committed
-from tests.system.session import SMALL, finish
+from tests.system.session import SMALL
 
 SEARCH = {"algorithm": "map_elites", "batch": 40, "centres": 4, "iso_sigma": 0.2, "evaluation_episodes": 2}
 GENERATIONS = 14
@@ -26,23 +22,6 @@ def undisturbed(tmp_path_factory):
     """A finished run on one worker, for reading only."""
     folder = tmp_path_factory.mktemp("map_elites") / "run"
     return api.run(api.load_config(config_of()), folder).run
-
-
-@pytest.mark.parametrize("compute", [{"workers": 2}, {"workers": 3}], ids=str)
-def test_number_and_kind_of_workers(tmp_path, undisturbed, compute):
-    other = api.run(api.load_config(config_of(**compute)), tmp_path / "run", on_notice=pytest.fail).run
-    assert digest_parts(other.folder) == digest_parts(undisturbed.folder)
-    assert set(other.history["workers"]) == {compute["workers"]}
-
-
-def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
-    folder = tmp_path / "run"
-    for at, nth, newest in (("mid_transaction", 3, 1), ("before_commit", 4, 4), ("after_commit", 4, 8)):
-        kill, config = {"at": at, "nth": nth}, None if folder.exists() else config_of()
-        assert finish(folder, config=config, kill=kill) == -signal.SIGKILL
-        assert committed(folder) == newest
-    assert finish(folder) == 0
-    assert digest_parts(folder) == digest_parts(undisturbed.folder)
 
 
 def test_a_fork_whose_map_is_empty_begins_with_children_of_the_centres(tmp_path, undisturbed):

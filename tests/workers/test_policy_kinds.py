@@ -165,14 +165,22 @@ def test_simd_says_why_it_has_no_memory():
     assert BACKENDS["xla"].why_not(SHIPPED["point_maze"], PolicySpec((2, 2), memory=4)) == ""
 
 
-def test_initial_weights_of_every_kind_have_their_norms():
+@pytest.mark.parametrize(("init", "first_norm"), [("unit_columns", 1.0), ("small_columns", 0.01)])
+def test_initial_weights_of_every_kind_have_their_norms(init: str, first_norm: float):
     for policy in (*KINDS, PolicySpec((2, 8, 2), memory=4), PolicySpec((2, 2), bias=False, memory=4)):
-        flat_D, start = initial_parameters(policy, "unit_columns", 0), 0
+        flat_D, start = initial_parameters(policy, init, 0), 0
         for number, (inputs, outputs) in enumerate(policy.layers, 1):
             weights, start = flat_D[start : start + inputs * outputs].reshape(inputs, outputs), start + inputs * outputs
-            norm = 0.01 if number == len(policy.layers) else 1.0
+            norm = 0.01 if number == len(policy.layers) else first_norm
             np.testing.assert_allclose(np.linalg.norm(weights, axis=0), norm, rtol=1e-5)
             if policy.bias:
                 assert not flat_D[start : start + outputs].any()
                 start += outputs
         assert start == policy.parameters == flat_D.size
+
+
+def test_initial_weights_of_layers_and_of_centres_differ():
+    """In layers of equal shapes, which one key for all would make equal."""
+    first_D, other_D = (initial_parameters(PolicySpec((8, 8, 8, 8)), "unit_columns", 0, centre) for centre in (0, 1))
+    assert not np.allclose(first_D[:64], first_D[72:136])
+    assert not np.allclose(first_D, other_D)

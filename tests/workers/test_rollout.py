@@ -155,16 +155,6 @@ def test_results_do_not_alias_each_other(spec, kind):
     assert [name for name, value in arrays.items() if not value.flags.owndata] == []
 
 
-def test_running_a_chunk_again_gives_the_same_bits(spec):
-    worker, point = chunk_runner(spec()), centre(random_parameters(1))
-    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
-        first, second = worker(point, chunk), worker(point, chunk)
-        assert isinstance(first, EpisodesResult)
-        assert isinstance(second, EpisodesResult)
-        for name in ("fitness", "descriptor", "steps", "goal_distance"):
-            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-
-
 def test_memory_of_xla_does_not_grow_with_the_length_of_episodes():
     """What XLA sets aside for a chunk is the same for 200 steps and for 20,000."""
     sizes = []
