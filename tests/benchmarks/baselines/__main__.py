@@ -70,13 +70,13 @@ def main() -> None:
                     check=False,
                 )
                 if done.returncode:
-                    failed.append(name)
+                    failed.append(f"{name} (exit code {done.returncode})")
                     continue
                 put(given.results, json.loads(done.stdout.splitlines()[-1]))
                 print(done.stdout.splitlines()[-1], flush=True)
     print(in_words(read(given.results)))
     if failed:
-        sys.exit(f"failed, and said why above: {', '.join(failed)}")
+        sys.exit(f"failed, and said why above if no signal ended it: {', '.join(failed)}")
 
 
 if __name__ == "__main__":
