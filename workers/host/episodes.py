@@ -46,29 +46,32 @@ class Lanes:
 def run_episodes(
     lanes: Lanes,
     spec: WorkerSpec,
-    policies: LanePolicies,
+    parameters_L_D: FloatArray,
     mean: FloatArray,
+    std: FloatArray,
     reset_keys_L_4: NDArray[np.uint32],
+    action_keys_L_4: NDArray[np.uint32] | None = None,
     *,
-    training: bool,
     runs_L: NDArray[np.bool_] | None = None,
     watched: Watched | None = None,
 ) -> Episodes:
-    """One episode in each lane.
+    """One episode in each lane, all of a policy of its own.
 
     Lanes whose episode has ended, and those that do not run, keep their policy with an observation that does not
     change, so that the shapes of all products stay the same.
 
     Args:
-        mean: observation statistics, from which sums of observations are shifted, [O] or [L, O].
-        training: whether sums of observations are computed; otherwise traces are.
+        mean, std: observation statistics, [O] of all lanes or [L, O].
+        action_keys_L_4: stream keys of the action noise of training episodes, which have sums of observations, shifted
+            by `mean`; None for evaluations, which have traces.
         runs_L: which lanes run; None for all. The results of the others are 0.
         watched: filled with the episode of one lane.
 
     Returns:
         Episodes with leading axis [L].
     """
-    count, size, task = len(reset_keys_L_4), spec.policy.widths[0], lanes.task
+    count, size, task, training = len(reset_keys_L_4), spec.policy.widths[0], lanes.task, action_keys_L_4 is not None
+    policies = LanePolicies(spec, parameters_L_D, mean, std, action_keys_L_4)
     alive_L = np.ones(count, bool) if runs_L is None else runs_L.copy()
     environments = [lanes[lane] if alive_L[lane] else None for lane in range(count)]
     running = [(lane, environment) for lane, environment in enumerate(environments) if environment is not None]
@@ -134,7 +137,7 @@ def run_episodes(
             running = still
     except BaseException as error:
         place = f"step {step}" if step else "the reset"
-        seed, shown = seed_of(reset_keys_L_4[lane]), shown_parameters(policies.parameters_L_D[lane])
+        seed, shown = seed_of(reset_keys_L_4[lane]), shown_parameters(parameters_L_D[lane])
         error.add_note(f"raised in {place} of the episode whose reset has the seed {seed}; its policy has {shown}")
         raised_in_lane(error, lane)
         raise
@@ -145,7 +148,7 @@ def run_episodes(
     failures = []
     for lane in np.flatnonzero(steps_L > 0).tolist():
         if why := _why_invalid(bad_reward_L.get(lane), returns_L[lane], descriptor_L_B[lane]):
-            shown = shown_parameters(policies.parameters_L_D[lane])
+            shown = shown_parameters(parameters_L_D[lane])
             failures.append(
                 FailedEpisode(lane, f"(seed {seed_of(reset_keys_L_4[lane])}): {why}; its policy has {shown}")
             )

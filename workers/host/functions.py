@@ -13,6 +13,7 @@ from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.raised import raised
 from workers.environments.function_task import FunctionTask
 from workers.host.caller import CallFailedError
+from workers.host.episodes import Watched
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import Episodes, FailedEpisode
 
@@ -29,15 +30,19 @@ def run_calls(
     called: Callable[[FloatArray, int], tuple[float, Any]],
     spec: WorkerSpec,
     parameters_L_D: FloatArray,
+    mean: FloatArray,
+    std: FloatArray,
     reset_keys_L_4: NDArray[np.uint32],
+    action_keys_L_4: NDArray[np.uint32] | None = None,
     *,
-    training: bool,
     runs_L: NDArray[np.bool_] | None = None,
+    watched: Watched | None = None,
 ) -> Episodes:
-    """One call for each lane that runs, in their order; see `workers.host.episodes.run_episodes`.
+    """One call for each lane that runs, in their order.
 
     Args:
         called: calls the task, here or in another process.
+        others: those of `workers.host.episodes.run_episodes`. Keys of the noise only tell training from evaluation.
 
     A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr.
     """
@@ -54,8 +59,11 @@ def run_calls(
                 short = task.parameters.text(parameters_L_D[lane], SHOWN)
                 reason = "; ".join(line.strip() for line in why.splitlines())[:LONGEST]
                 failures.append(FailedEpisode(lane, f"with {short} (seed {seed}): {reason}"))
-    sums_L_O = np.zeros((lanes, 1 if training else 0), np.float32)
-    points = 0 if training else POINTS
+    if watched is not None:
+        watched.descriptors.extend([descriptor_L_B[watched.lane]] * 2)
+        watched.returns.extend([0.0, fitness_L[watched.lane]])
+    sums_L_O = np.zeros((lanes, 0 if action_keys_L_4 is None else 1), np.float32)
+    points = POINTS if action_keys_L_4 is None else 0
     return Episodes(
         fitness=fitness_L,
         returns=fitness_L,

@@ -34,7 +34,6 @@ class LanePolicies:
             action_keys_L_4: stream keys of the action noise of training episodes; None for evaluations.
         """
         self._spec, self._mean, self._std = spec, mean, std
-        self.parameters_L_D = parameters_L_D
         self._layers = _lane_layers(spec, parameters_L_D)
         self._memory = initial_memory(np, spec.policy, len(parameters_L_D), 1)
         self._key = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from workers.host.caller import Caller
 from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes
 from workers.host.functions import run_calls
 from workers.host.noise import gradient_summer, members
-from workers.host.policies import LanePolicies
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
@@ -93,57 +92,15 @@ class Host(RolloutBackend):
         return call
 
 
-class Runner(Protocol):
-    """Function that runs one episode in each lane L, all of a policy of its own."""
-
-    def __call__(
-        self,
-        parameters_L_D: Any,
-        mean: Any,
-        std: Any,
-        reset_keys_L_4: Any,
-        action_keys_L_4: Any = None,
-        *,
-        runs_L: Any = None,
-        watched: Watched | None = None,
-    ) -> Episodes:
-        """Episodes with leading axis [L]; with keys of the action noise, those of training.
-
-        Args:
-            mean, std: observation statistics, [O] of all lanes or [L, O].
-            runs_L: which lanes run; None for all.
-            watched: filled with the episode of one lane.
-        """
-        ...
-
-
-def make_runner(spec: WorkerSpec) -> Runner:
-    """The runner of a worker, with its environments or its function."""
+def make_runner(spec: WorkerSpec) -> Callable[..., Episodes]:
+    """`run_episodes` with the environments of a worker, or `run_calls` with its function."""
     if is_function_task(spec.environment):
         given = spec.environment, spec.environment_options
         function = make_function_task(*given)
         called = function if spec.time_limit_s is None else Caller(*given, spec.time_limit_s)
-
-        def call(parameters_L_D, mean, std, reset_keys_L_4, action_keys_L_4=None, *, runs_L=None, watched=None):
-            training = action_keys_L_4 is not None
-            episodes = run_calls(
-                function, called, spec, parameters_L_D, reset_keys_L_4, training=training, runs_L=runs_L
-            )
-            if watched is not None:
-                watched.descriptors.extend([episodes.descriptor[watched.lane]] * 2)
-                watched.returns.extend([0.0, episodes.returns[watched.lane]])
-            return episodes
-
-        return call
-    lanes = Lanes(make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size))
-
-    def run(parameters_L_D, mean, std, reset_keys_L_4, action_keys_L_4=None, *, runs_L=None, watched=None):
-        policies = LanePolicies(spec, parameters_L_D, mean, std, action_keys_L_4)
-        training = action_keys_L_4 is not None
-        given = (lanes, spec, policies, mean, reset_keys_L_4)
-        return run_episodes(*given, training=training, runs_L=runs_L, watched=watched)
-
-    return run
+        return partial(run_calls, function, called, spec)
+    task = make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size)
+    return partial(run_episodes, Lanes(task), spec)
 
 
 def _by_episode(keys_P_S_E_4: np.ndarray) -> np.ndarray:
@@ -165,7 +122,7 @@ def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
     return Episodes._make([*columns, *named, tuple(failed for episodes in by_episode for failed in episodes.failures)])
 
 
-def _recording(run: Runner, request: RecordRequest) -> Recording:
+def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recording:
     centre, slot = request.centre, request.slot
     count = EVALUATION_EPISODES_PER_CHUNK if request.policy is None else POLICY_SLOTS
     key = request.reset_key
