@@ -17,8 +17,8 @@ import pytest
 from es_service.environments.single import TaskEnv
 from es_service.environments.vector import TaskVectorEnv
 from tests.es_service.test_environments import actions_of, same
+from workers.child import LostProcessError
 from workers.environments import TaskError
-from workers.lanes import blocks
 
 DRAWN, SORTED_START = "tests.es_service.xla_tasks:Drawn", "tests.es_service.xla_tasks:SortedStart"
 WHY = {
@@ -90,7 +90,7 @@ def test_a_lost_process_is_an_error():
     with quietly(DRAWN, 2) as envs:
         envs.reset(seed=0)
         os.kill(envs._lanes._blocks._children[0]._process.pid, signal.SIGKILL)
-        with pytest.raises(blocks.LostProcessError, match=r"xla computes .*Drawn has ended with signal SIGKILL; make"):
+        with pytest.raises(LostProcessError, match=r"xla computes .*Drawn has ended with signal SIGKILL; make"):
             envs.step(np.zeros((2, 3)))
 
 

@@ -296,7 +296,7 @@ def test_a_call_in_a_process_of_its_own_imports_what_its_worker_can(tmp_path, mo
 def test_a_process_that_cannot_be_started_once_is_started_by_the_next_call(monkeypatch):
     caller = Caller(HILL, {}, 20.0)
     with monkeypatch.context() as patch:
-        patch.setattr("workers.host.caller.start_child", lambda start: (_ for _ in ()).throw(BlockingIOError()))
+        patch.setattr("workers.child.start_child", lambda start: (_ for _ in ()).throw(BlockingIOError()))
         with pytest.raises(BlockingIOError):
             caller(np.zeros(3, np.float32), 0)
     assert np.isfinite(caller(np.zeros(3, np.float32), 0)[0])

@@ -8,13 +8,7 @@ before it loads JAX, and the caller has loaded it in its own way.
 
 from __future__ import annotations
 
-import os
-import signal
-import socket
-import subprocess
-import weakref
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -22,20 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.options import OptionValue
-from es_service.protocol.parent import bound, start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError
-from es_service.protocol.wire import framed, receive
+from workers.child import Child, LostProcessError
 from workers.environments import TaskError
 from workers.lanes.functions import Seen
 from workers.xla_cache import xla_cache_settings
 
 BLOCK = 16
 """Lanes that xla computes together."""
-
-
-class LostProcessError(RuntimeError):
-    """The process that computes lanes has ended; the message says how."""
 
 
 class Blocks:
@@ -58,13 +47,14 @@ class Blocks:
         bounds = [0, *range(share - first, lanes, share), lanes]
         self._bounds = np.array(bounds)
         """Lanes of process p are those from bounds[p] to bounds[p + 1]."""
-        self._children: list[_Child] = []
+        self._name = name
+        self._children: list[Child] = []
+        environment = child_environment() | xla_cache_settings()
         try:
             for start, end in pairwise(bounds):
-                self._children.append(_Child(name))
-                self._children[-1].ask((name, dict(options), end - start, first if start == 0 else 0))
-            for child in self._children:
-                child.answer()
+                lanes_of_it = (end - start, first if start == 0 else 0)
+                self._children.append(Child("workers.lanes.process", environment, name, dict(options), *lanes_of_it))
+            self._answers(self._children)
         except BaseException:
             self.close()
             raise
@@ -80,14 +70,14 @@ class Blocks:
     def step(self, action_N_A: NDArray[np.float32]) -> Seen:
         """Step all lanes."""
         for child, start, end in zip(self._children, self._bounds[:-1], self._bounds[1:], strict=True):
-            child.ask(("step", action_N_A[start:end]))
-        return _joined([child.answer() for child in self._children])
+            child.ask("step", action_N_A[start:end])
+        return _joined(self._answers(self._children))
 
     def words(self) -> NDArray[np.uint32]:
         """Words of the carries of all lanes, [N, words]."""
         for child in self._children:
-            child.ask(("words",))
-        return _joined([child.answer() for child in self._children])
+            child.ask("words")
+        return _joined(self._answers(self._children))
 
     def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
         """Set the carries of some lanes, in increasing order."""
@@ -104,56 +94,22 @@ class Blocks:
         asked = []
         for child, start, low, high in zip(self._children, self._bounds[:-1], cuts[:-1], cuts[1:], strict=True):
             if low < high:
-                child.ask((kind, lane_M[low:high] - start, given_M[low:high]))
+                child.ask(kind, lane_M[low:high] - start, given_M[low:high])
                 asked.append(child)
-        return [child.answer() for child in asked]
+        return self._answers(asked)
 
-
-class _Child:
-    """A process of `workers.lanes.process`. It ends with this one, when it is closed, or when nobody refers to it."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._socket, theirs = socket.socketpair()
-        with theirs:
-            self._process = start_child(
-                lambda: subprocess.Popen(
-                    bound("workers.lanes.process", str(theirs.fileno())),
-                    pass_fds=[theirs.fileno()],
-                    stdin=subprocess.DEVNULL,
-                    env=child_environment() | xla_cache_settings(),
-                )
-            )
-        self._end = weakref.finalize(self, _ended, self._process, self._socket)
-
-    def ask(self, message: Any) -> None:
-        with suppress(OSError):  # it has ended, which `answer` finds
-            self._socket.sendall(framed(message))
-
-    def answer(self) -> Any:
-        """Raises TaskError with what the task's code raised, or LostProcessError."""
+    def _answers(self, children: Iterable[Child]) -> list[Any]:
+        """Answers of processes. Raises TaskError with what the task's code raised, or LostProcessError."""
         try:
-            answer = receive(self._socket)
-        except (EOFError, OSError):
-            self.close()
-            code = self._process.returncode
-            how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            answers = [child.answer() for child in children]
+        except LostProcessError as lost:
             raise LostProcessError(
-                f"the process in which xla computes {self._name} has ended with {how}; make the environments anew"
+                f"the process in which xla computes {self._name} has ended with {lost}; make the environments anew"
             ) from None
-        if isinstance(answer, RaisedError):
-            raise TaskError(answer.message)
-        return answer
-
-    def close(self) -> None:
-        self._end()
-
-
-def _ended(process: subprocess.Popen[bytes], end: socket.socket) -> None:
-    end.close()
-    with suppress(ProcessLookupError):
-        os.kill(process.pid, signal.SIGKILL)  # a process that was forked from this one may hold the socket open
-    process.wait()
+        for answer in answers:
+            if isinstance(answer, RaisedError):
+                raise TaskError(answer.message)
+        return answers
 
 
 def _joined(answers: list[Any]) -> Any:

@@ -5,8 +5,6 @@ python -m workers.lanes.process DESCRIPTOR     # of a socket; its parent sets th
 
 from __future__ import annotations
 
-import signal
-import socket
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,8 +16,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
-from es_service.protocol.raised import raised
-from es_service.protocol.wire import framed, receive
+from workers.child import answer_parent
 from workers.environments import make_environment
 from workers.lanes.blocks import BLOCK
 from workers.lanes.functions import Seen, lane_functions
@@ -117,28 +114,11 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def main(descriptor: int) -> None:
-    """Answer until the parent closes its end: None when the lanes are there, then the requested values."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when this ends
-    with socket.socket(fileno=descriptor) as parent:
-        name, *given = receive(parent)
-        try:
-            lanes = BlockLanes(name, *given)
-        except BaseException as error:  # also sys.exit in the user's module
-            parent.sendall(framed(raised(error, name)))
-            return
-        parent.sendall(framed(None))
-        while True:
-            try:
-                kind, *given = receive(parent)
-            except EOFError:
-                return
-            try:
-                answer = getattr(lanes, kind)(*given)
-            except Exception as error:
-                answer = raised(error, name)
-            parent.sendall(framed(answer))
+def _lanes(name: str, *given: Any) -> Any:
+    """The function that answers the parent: values of the lanes, by name of the method."""
+    lanes = BlockLanes(name, *given)
+    return lambda kind, *arguments: getattr(lanes, kind)(*arguments)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    answer_parent(int(sys.argv[1]), _lanes)
