@@ -68,4 +68,5 @@ def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] |
             raise
         raise told from error
     with contextlib.suppress(SystemExit):
-        print_summary(console, outcome.run, outcome.reason)
+        reason = outcome.reason if began else f"no generation was run, since {outcome.reason}"
+        print_summary(console, outcome.run, reason)

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
-from es_service.errors import ConfigError, NotInRunError
+from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
@@ -100,7 +100,7 @@ def certify_run(
     for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("top", top or 0, 0)):
         whole(name, value, least)
     run = open_run(folder)
-    with RunStore.open(run.folder) as store:
+    with _naming_this_call(), RunStore.open(run.folder) as store:
         for notice in store.notices:
             on_notice(notice)
         config = evaluation_config(run, workers)
@@ -115,6 +115,21 @@ def certify_run(
             certified = _certify(engine, config, _different(chosen), number, episodes, keep, by)
         store.add_certification([stored(policy) for policy in certified])
     return certified
+
+
+@contextmanager
+def _naming_this_call() -> Iterator[None]:
+    """The store advises to resume a run after an error; here it is the certification that is repeated."""
+    try:
+        yield
+    except StoreError as error:
+        error.ways_out = tuple(
+            replace(way, action="certify", purpose="certify it after the cause is removed")
+            if way.action == "resume"
+            else way
+            for way in error.ways_out
+        )
+        raise
 
 
 def certify(

@@ -227,6 +227,16 @@ def test_a_driver_keeps_others_from_certifying(finished):
         certify_run(run.folder)
 
 
+def test_after_an_error_of_the_store_the_certification_is_repeated(finished, tmp_path):
+    run, _ = finished
+    folder = shutil.copytree(run.folder, tmp_path / "run")
+    (folder / "run.lock").unlink(missing_ok=True)
+    (folder / "run.lock").mkdir()
+    with pytest.raises(StoreError, match="locking") as caught:
+        certify_run(folder)
+    assert [(way.action, way.run) for way in caught.value.ways_out] == [("certify", str(folder))]
+
+
 def test_candidates_are_the_best_centre_and_the_fittest_elites(finished):
     run, _ = finished
     names = {one.name for one in certify_run_without_storing(run, top=3)}
