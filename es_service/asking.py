@@ -145,14 +145,16 @@ class AskTell:
             raise EvaluationError("the run has ended, so nothing is asked; resume it with a larger budget")
         count, size = len(asked), asked.observation_mean.shape[1]
         fitness_N = _array("fitness", fitness, (count,)).astype(np.float32)
-        is_valid_N = np.ones(count, bool) if valid is None else _array("valid", valid, (count,)).astype(bool)
-        fitness_N = np.where(is_valid_N, fitness_N, np.float32(np.nan))
+        is_valid_N = np.ones(count, bool) if valid is None else _array("valid", valid, (count,))
+        if not np.isin(is_valid_N, (0, 1)).all():
+            raise ConfigError("valid has numbers other than 0 and 1; must be bools", field="valid", allowed="bools")
+        fitness_N = np.where(is_valid_N.astype(bool), fitness_N, np.float32(np.nan))
         if descriptor is None:
             descriptor = asked.parameters[:, : self._dimensions]
         descriptor_N_B = _array("descriptor", descriptor, (count, self._dimensions)).astype(np.float32)
-        steps_N = np.ones(count, np.int64) if steps is None else _array("steps", steps, (count,)).astype(np.int64)
-        if (wrong := steps_N[(steps_N < 1) | (steps_N > MOST_STEPS)]).size:
-            allowed = f"from 1 to {MOST_STEPS:,}"
+        steps_N = np.ones(count, np.int64) if steps is None else _array("steps", steps, (count,))
+        if (wrong := steps_N[~((steps_N >= 1) & (steps_N <= MOST_STEPS) & (steps_N % 1 == 0))]).size:
+            allowed = f"whole numbers from 1 to {MOST_STEPS:,}"
             raise ConfigError(f"steps has {wrong[0]}; must be {allowed}", field="steps", allowed=allowed)
         observed = Moments(0.0, np.zeros(size), np.zeros(size))
         if moments is not None:
@@ -163,6 +165,9 @@ class AskTell:
                 allowed = f"(count, mean [{size}], sum of squared deviations [{size}])"
                 raise ConfigError(f"moments must be {allowed}: {error}", field="moments", allowed=allowed) from error
             mean_O, m2_O = (_array("moments", array, (size,)).astype(np.float64) for array in (mean, m2))
+            if not (np.isfinite([number, *mean_O, *m2_O]).all() and number >= 0.0 and (m2_O >= 0.0).all()):
+                allowed = "finite numbers, and neither the count nor a square negative"
+                raise ConfigError(f"moments must be {allowed}", field="moments", allowed=allowed)
             observed = Moments(number, mean_O, m2_O)
         self._asked = None
         self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed))
@@ -276,7 +281,10 @@ def ask_tell(
 
 def _array(name: str, given: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """An argument as an array of a shape. Raises ConfigError if it is none."""
-    array = np.asarray(given)
+    try:
+        array = np.asarray(given)
+    except ValueError:  # a list of lists of different lengths
+        array = np.asarray(given, object)
     if array.shape != shape or array.dtype.kind not in "fiub":
         raise ConfigError(
             f"{name} has the shape {array.shape} and the type {array.dtype}; must be numbers of shape {shape}",

@@ -8,12 +8,15 @@ import socket
 import subprocess
 import weakref
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from es_service.protocol.parent import bound, start_child
 from es_service.protocol.raised import raised
 from es_service.protocol.wire import framed, receive
+
+GUARD = ("/bin/sh", "-c", "read -r _; kill -9 0")
+"""Ends its process group once the other end of its input is closed, also by the end of the process that held it."""
 
 
 class LostProcessError(RuntimeError):
@@ -21,32 +24,32 @@ class LostProcessError(RuntimeError):
 
 
 class Child:
-    """A process that runs `answer_parent`. It ends with this one, when it is closed, or when nobody refers to it."""
+    """A process that runs `answer_parent`. It and those that it has started end with this one, when it is closed, or
+    when nobody refers to it.
 
-    def __init__(self, module: str, environment: Mapping[str, str], name: str, *given: Any) -> None:
-        """Start a module, and ask for its function; `answer` then gives None or why there is none.
+    The first request has the arguments of the `make` of `answer_parent`; its answer is None, or why there is no
+    function. If the wait for an answer is interrupted, the process ends, since a later request would get that answer.
+    """
 
-        Args:
-            environment: variables of the process.
-            name, given: arguments of the `make` of `answer_parent`.
-        """
-        self._socket, theirs = socket.socketpair()
-        try:
-            with theirs:
-                self._process = start_child(
-                    lambda: subprocess.Popen(
-                        bound(module, str(theirs.fileno())),
-                        env=environment,
-                        pass_fds=[theirs.fileno()],
-                        stdin=subprocess.DEVNULL,
-                        start_new_session=True,
-                    )
+    def __init__(self, module: str, environment: Mapping[str, str]) -> None:
+        """Start a module with these environment variables."""
+        with ExitStack() as unless_started:
+            self._socket, theirs = map(unless_started.enter_context, socket.socketpair())
+            process = start_child(
+                lambda: subprocess.Popen(
+                    bound(module, str(theirs.fileno())),
+                    env=environment,
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    process_group=0,
                 )
-        except BaseException:
-            self._socket.close()
-            raise
-        self._end = weakref.finalize(self, _end, self._process, self._socket)
-        self.ask(name, *given)
+            )
+            unless_started.callback(_end, os.getpid(), self._socket, process)
+            theirs.close()
+            guard = subprocess.Popen(GUARD, stdin=subprocess.PIPE, process_group=process.pid)
+            unless_started.pop_all()
+        self._process = process
+        self._end = weakref.finalize(self, _end, os.getpid(), self._socket, process, guard)
 
     def ask(self, *request: Any) -> None:
         """Send the arguments of one call of the function."""
@@ -58,15 +61,16 @@ class Child:
 
         Raises:
             TimeoutError: nothing came within `limit_s`.
-            LostProcessError: the process has ended, "signal SIGKILL" or "exit code 3"; this object is closed.
+            LostProcessError: the process has ended, "signal SIGKILL" or "exit code 3".
+            After any error, this object is closed.
         """
-        self._socket.settimeout(limit_s)
         try:
+            self._socket.settimeout(limit_s)
             return receive(self._socket)
-        except TimeoutError:
-            raise
-        except (EOFError, OSError):
+        except BaseException as error:
             self.close()
+            if isinstance(error, TimeoutError) or not isinstance(error, EOFError | OSError):
+                raise
             code = self._process.returncode
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
             raise LostProcessError(how) from None
@@ -76,11 +80,15 @@ class Child:
         self._end()
 
 
-def _end(process: subprocess.Popen[bytes], end: socket.socket) -> None:
+def _end(parent: int, end: socket.socket, process: subprocess.Popen[bytes], *guard: subprocess.Popen[bytes]) -> None:
     end.close()
+    if os.getpid() != parent:
+        return  # in a process that was forked from it
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)  # a process that was forked from this one may hold the socket open
-    process.wait()
+        os.killpg(process.pid, signal.SIGKILL)
+    for ended in (process, *guard):
+        with ended:  # which waits, and closes what is open
+            pass
 
 
 def answer_parent(descriptor: int, make: Callable[..., Callable[..., Any]]) -> None:

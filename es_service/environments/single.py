@@ -58,6 +58,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             seed: None: its episodes go on, and have a random seed if it never had one.
             options: not used.
         """
+        self._require_open()
         super().reset(seed=seed)
         if seed is not None or not self._is_seeded:
             self._lanes.seed_N[0] = random_seed() if seed is None else seed_given(seed)
@@ -71,8 +72,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Step with an action [A]. Raises ValueError if it has another shape, or before the first reset, and
         ClosedEnvironmentError after `close`."""
-        if self._is_closed:
-            raise ClosedEnvironmentError("the environment is closed; make another one")
+        self._require_open()
         action_A = np.asarray(action, np.float32)
         if action_A.shape != self.action_space.shape:
             raise ValueError(f"action has the shape {action_A.shape}; must be {self.action_space.shape}")
@@ -94,6 +94,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     def set_state(self, state: LanesState) -> None:
         """Go on from what `get_state` has returned."""
+        self._require_open()
         self._lanes.set_state(state)
         if self._trails is not None:
             self._trails.forget()
@@ -104,7 +105,12 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._is_closed = True
         self._lanes.close()
 
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise ClosedEnvironmentError("the environment is closed; make another one")
+
     def _require_reset(self, before: str) -> None:
+        self._require_open()
         if not self._is_seeded:
             raise ValueError(f"call reset before {before}")
 

@@ -107,6 +107,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         Returns:
             The observations of all environments, and the info of those that were reset.
         """
+        self._require_open()
         seeds = self._seeds(seed)
         lane_M = np.flatnonzero(self._mask(options))
         for lane in lane_M.tolist():
@@ -124,8 +125,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             ValueError: the actions have another shape, or an episode is over that the caller has to reset.
             ClosedEnvironmentError: the environments are closed.
         """
-        if self.closed:
-            raise ClosedEnvironmentError("the environments are closed; make others")
+        self._require_open()
         action_N_A = np.asarray(actions, np.float32)
         if action_N_A.shape != self.action_space.shape:
             raise ValueError(f"actions have the shape {action_N_A.shape}; must be {self.action_space.shape}")
@@ -169,6 +169,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
 
     def set_state(self, state: State) -> None:
         """Go on from what `get_state` has returned; the next step is that of those environments."""
+        self._require_open()
         lanes, is_over_N, observation_N_O = state
         self._lanes.set_state(lanes)
         self._observation_N_O[:] = observation_N_O
@@ -194,7 +195,12 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         """End the threads and processes."""
         self._lanes.close()
 
+    def _require_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; make others")
+
     def _require_reset(self, before: str) -> None:
+        self._require_open()
         if not self._is_seeded_N.all():
             raise ValueError(f"call reset before {before}")
 
@@ -234,7 +240,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             return [seed_given(int(seed) + lane) for lane in range(self.num_envs)]
-        if isinstance(seed, str) or any(not isinstance(one, int | np.integer | None) for one in seed):
+        if not isinstance(seed, Sequence | np.ndarray) or any(
+            not isinstance(one, int | np.integer | None) for one in seed
+        ):
             raise ValueError(f"seed = {seed!r}; must be a whole number, or a list of these or None")
         if len(seed) != self.num_envs:
             raise ValueError(

@@ -80,6 +80,7 @@ def test_policies_act_as_in_the_service_s_own_episodes(policy, tmp_path):
     ) as search:
         while (asked := search.ask()) is not None:
             mazes = [CornerMaze() for _ in range(len(asked))]
+            asked.act(np.ones((len(asked), 2)), 0)  # the first step of other episodes, which leaves no memory
             seen = np.array([maze.reset(int(seed)) for maze, seed in zip(mazes, asked.seed, strict=True)])
             returns = np.zeros(len(asked))
             for step in range(steps):
@@ -165,6 +166,14 @@ def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
         ({"fitness": np.zeros(2), "steps": [0, 1]}, "steps"),
         ({"fitness": np.zeros(2), "steps": [1, 2**31]}, "steps"),
         ({"fitness": np.zeros(2), "moments": (1.0, [0.0, 1.0], [0.0])}, "moments"),
+        ({"fitness": [[1.0], [1.0, 2.0]]}, "fitness"),
+        ({"fitness": np.zeros(2), "steps": [1.0, 1.5]}, "steps"),
+        ({"fitness": np.zeros(2), "steps": [1.0, np.nan]}, "steps"),
+        ({"fitness": np.zeros(2), "valid": [1.0, np.nan]}, "valid"),
+        ({"fitness": np.zeros(2), "moments": (np.nan, [0.0], [1.0])}, "moments"),
+        ({"fitness": np.zeros(2), "moments": (-1.0, [0.0], [1.0])}, "moments"),
+        ({"fitness": np.zeros(2), "moments": (1.0, [np.inf], [1.0])}, "moments"),
+        ({"fitness": np.zeros(2), "moments": (1.0, [0.0], [-1.0])}, "moments"),
         ({"fitness": np.zeros(2), "moments": 3}, "moments"),
         ({"fitness": np.zeros(2), "moments": ("many", [0.0, 1.0], [0.0, 1.0])}, "moments"),
     ],

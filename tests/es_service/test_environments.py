@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
+import pickle
 import subprocess
 import sys
 import warnings
@@ -327,20 +329,36 @@ def test_closed_environments_do_not_step(made):
     envs = made()
     envs.reset(seed=0)
     envs.step(envs.action_space.sample())
+    state = envs.get_state()
     envs.close()
-    with pytest.raises(ClosedEnvironmentError, match="closed; make"):
-        envs.step(envs.action_space.sample())
+    for call in (
+        envs.reset,
+        envs.get_state,
+        lambda: envs.step(envs.action_space.sample()),
+        lambda: envs.set_state(state),
+    ):
+        with pytest.raises(ClosedEnvironmentError, match="closed; make"):
+            call()
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_what_cannot_be_copied_says_how_to_make_another(copied):
+    with pytest.raises(TypeError, match=r"point_maze hold machine code .* give them with set_state what get_state"):
+        copied(many()._lanes)
+    if copied is not copy.copy:
+        with pytest.raises(TypeError, match="cannot be copied"):
+            copied(TaskEnv("point_maze"))
 
 
 def test_observations_are_new_arrays_unless_one_is_asked_for_that_is_reused():
-    for copy in (True, False):
-        envs = TaskVectorEnv("point_maze", 3, max_episode_steps=4, copy=copy)
+    for copies in (True, False):
+        envs = TaskVectorEnv("point_maze", 3, max_episode_steps=4, copy=copies)
         first = envs.reset(seed=0)[0]
         before = first.copy()
         found = [envs.step(actions) for actions in actions_of(envs, 5)]
-        assert np.array_equal(first, before) == copy
-        assert (first is found[0][0]) == (not copy)
-        if copy:
+        assert np.array_equal(first, before) == copies
+        assert (first is found[0][0]) == (not copies)
+        if copies:
             expected = found
     same([one[1:] for one in found], [one[1:] for one in expected])  # what an episode ended with is never reused
     same(found[-1][0], expected[-1][0])

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from contextlib import closing
@@ -92,6 +93,34 @@ def test_a_lost_process_is_an_error():
         os.kill(envs._lanes._blocks._children[0]._process.pid, signal.SIGKILL)
         with pytest.raises(LostProcessError, match=r"xla computes .*Drawn has ended with signal SIGKILL; make"):
             envs.step(np.zeros((2, 3)))
+
+
+@pytest.mark.long
+def test_after_an_interrupted_step_no_answer_is_that_of_another_call():
+    with quietly(DRAWN, 20, threads=2) as envs:
+        envs.reset(seed=0)
+        child = envs._lanes._blocks._children[1]._process.pid
+        os.kill(child, signal.SIGSTOP)
+        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(np.zeros((20, 3)))
+        for call in (lambda: envs.step(np.zeros((20, 3))), envs.get_state, envs.reset):
+            with pytest.raises(LostProcessError, match="make the environments anew"):
+                call()
+
+
+@pytest.mark.long
+def test_the_end_of_a_forked_process_does_not_end_the_child():
+    with quietly(DRAWN, 2) as envs:
+        envs.reset(seed=0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # JAX warns
+            forked = os.fork()
+        if not forked:
+            envs._lanes._blocks.close()
+            os._exit(0)
+        assert os.waitpid(forked, 0) == (forked, 0)
+        envs.step(np.zeros((2, 3)))
 
 
 @pytest.mark.long

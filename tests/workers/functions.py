@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
 import time
 from pathlib import Path
 
@@ -58,6 +59,20 @@ def forgetful(parameters):
 
 
 forgetful.parameters = {f"x{index}": (0.0, 1.0) for index in range(20)}
+
+
+class Uncalled:
+    """Its objects are no functions."""
+
+    parameters = 2
+
+
+def starting(parameters):
+    """It starts a process, and returns its number."""
+    return subprocess.Popen(["sleep", "1000"]).pid
+
+
+starting.parameters = 1
 
 
 def restless(parameters):

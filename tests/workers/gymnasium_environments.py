@@ -41,6 +41,20 @@ class Pairs(Words):
     observation_space, action_space = spaces.Discrete(2), spaces.MultiDiscrete([2, 2])
 
 
+class Unseen(Words):
+    """It has nothing to see."""
+
+    observation_space = spaces.Box(0.0, 1.0, (0,))
+
+
+class Still(Unseen):
+    """It has nothing to do."""
+
+    observation_space, action_space = spaces.Discrete(2), spaces.Box(0.0, 1.0, (0,))
+
+
+gymnasium.register("tests/Unseen-v0", Unseen)
+gymnasium.register("tests/Still-v0", Still)
 gymnasium.register("tests/Reach-v0", Reach, max_episode_steps=25)
 gymnasium.register("tests/Words-v0", Words)
 gymnasium.register("tests/Pairs-v0", Pairs)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+import time
 from io import StringIO
 
 import numpy as np
@@ -22,9 +25,11 @@ from es_service.report.write import write_report
 from es_service.runs.export import arrays, tables
 from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, spec, workers_in_this_process
+from tests.system.processes import is_running
 from tests.workers import functions
-from workers.environments import TaskError, describe_environment
+from workers.environments import TaskError, describe_environment, make_function_task
 from workers.host.caller import Caller
+from workers.host.functions import _called
 from workers.worker import make_worker
 
 MODULE = "tests.workers.functions"
@@ -261,6 +266,7 @@ def test_a_policy_is_refused_and_a_resolved_config_is_not(tmp_path):
     ("name", "value", "problem"),
     [
         ("parameters", {"width": (5.0, 1.0)}, r"parameters: \(5.0, 1.0\) is not a pair"),
+        ("parameters", True, "parameters = True is not a mapping"),
         ("parameters", {}, "parameters = {} is not a mapping from names to bounds"),
         ("start", {"depth": 1.0}, "start has depth, which is none of the parameters"),
         ("start", [1.0, 2.0], "start = .* has not one value for each of the 3 parameters"),
@@ -276,10 +282,58 @@ def test_a_function_that_contradicts_itself_is_refused(name, value, problem, mon
         describe_environment(HILL)
 
 
-@pytest.mark.parametrize("name", ["function:math:pi", "function:math:sin", "function:math:nothing"])
-def test_what_is_no_such_function_is_named(name):
-    with pytest.raises(TaskError, match=r"is no function|has no attribute parameters|has no function nothing"):
-        describe_environment(name)
+def test_numbers_of_numpy_are_numbers(monkeypatch):
+    monkeypatch.setattr(functions.hill, "parameters", {"width": (np.int64(1), np.float32(5.0)), "h": None, "r": None})
+    monkeypatch.setattr(functions.hill, "start", {})
+    task = describe_environment(HILL)
+    assert task.parameters is not None
+    assert task.parameters.bounds[0] == (1, 5.0)
+    assert [type(bound) for bound in task.parameters.bounds[0]] == [int, float]
+    monkeypatch.setattr(functions.hill, "parameters", np.int64(3))
+    assert describe_environment(HILL).action_size == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("math:pi", "is no function"),
+        ("math:sin", "has no attribute parameters"),
+        ("math:nothing", "has no function nothing"),
+        (f"{MODULE}:Uncalled", "is a class without __call__"),
+    ],
+)
+def test_what_is_no_such_function_is_named(name, problem):
+    with pytest.raises(TaskError, match=problem):
+        describe_environment(f"function:{name}")
+
+
+@pytest.mark.parametrize(("fitness", "why"), [("10**400", "a number"), ("1e39", "that float32 holds")])
+def test_what_is_too_large_is_no_fitness(fitness, why, monkeypatch):
+    monkeypatch.setattr(functions, "fragile", eval(f"lambda parameters: {fitness}"))
+    functions.fragile.parameters = ("x", "y")
+    task = make_function_task(FRAGILE, {})
+    _, _, told = _called(task, task, np.zeros(2, np.float32), 0)
+    assert told.endswith(why)
+
+
+@pytest.mark.parametrize("how", ["os.kill(os.getpid(), 9)", "caller.close(); time.sleep(60)"])
+def test_what_a_call_has_started_ends_with_its_worker(how):
+    program = f"""
+import os, time
+import numpy as np
+from workers.host.caller import Caller
+caller = Caller("function:{MODULE}:starting", {{}}, 20.0)
+print(int(caller(np.zeros(1, np.float32), 0)[0]), flush=True)
+{how}
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        started = int(parent.stdout.readline())
+        until = time.monotonic() + 60
+        while is_running(started):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        parent.kill()
 
 
 def test_a_call_in_a_process_of_its_own_imports_what_its_worker_can(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from es_service.protocol.sources import user_path, user_sources
 from es_service.runs.replay import record
 from es_service.runs.snapshot import Policy
 from tests.helpers import centre, random_parameters, spec
-from workers.environments import TaskError, describe_environment
+from workers.environments import TaskError, describe_environment, gymnasium_task
 from workers.worker import make_worker
 
 MODULE = "tests.workers.gymnasium_environments"
@@ -42,6 +42,33 @@ def config_of(environment, **task):
         "budget": {"generations": 2},
         "compute": {"engine": "inline", "workers": 1},
     }
+
+
+WHOLE = np.iinfo(np.int64)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gymnasium.spaces.Box(-0.1, 0.1, (3,), np.float64),
+        gymnasium.spaces.Box(-0.7, np.inf, (3,), np.float64),
+        gymnasium.spaces.Box(-2, 3, (3,), np.int64),
+        gymnasium.spaces.Box(0, 255, (3,), np.uint8),
+        gymnasium.spaces.Box(WHOLE.min, WHOLE.max, (3,), np.int64),
+    ],
+    ids=str,
+)
+def test_actions_are_in_the_space_and_reach_its_bounds(space):
+    action_L_A = np.linspace(-1.3, 1.3, 3 * 401, dtype=np.float32).reshape(-1, 3)
+    taken = gymnasium_task._acted("task", space)(action_L_A)
+    assert all(space.contains(one) for one in taken)
+    assert (np.diff(taken.reshape(-1).astype(np.float64)) >= 0).all()
+    for found, bound in ((taken.min(), space.low[0]), (taken.max(), space.high[0])):
+        assert np.isinf(bound) or float(found) == pytest.approx(float(bound), rel=1e-15)
+    if space.dtype == np.int64 and space.high[0] == 3:
+        values, counts = np.unique(taken[np.abs(action_L_A) < 1.0], return_counts=True)
+        assert values.tolist() == [-2, -1, 0, 1, 2, 3]
+        assert np.ptp(counts[1:-1]) <= 1
 
 
 @pytest.mark.parametrize("name", CLASSIC)
@@ -164,6 +191,8 @@ def test_options_are_arguments_of_make_and_constants_of_the_run(tmp_path):
         ("gymnasium:CartPol-v1", r"is not registered in Gymnasium .*; did you mean gymnasium:CartPole-v1\?"),
         (f"gymnasium:{MODULE}:tests/Words-v0", r"has observations of the space Text.*; Box and Discrete are supported"),
         (f"gymnasium:{MODULE}:tests/Pairs-v0", r"has actions of the space MultiDiscrete.*; Box and Discrete are"),
+        (f"gymnasium:{MODULE}:tests/Unseen-v0", "has observations of the space Box.*, which are empty"),
+        (f"gymnasium:{MODULE}:tests/Still-v0", "has actions of the space Box.*, which are empty"),
         ("gymnasium:no_such_module:Name-v0", "no_such_module"),
     ],
 )

@@ -21,6 +21,7 @@ from tests.helpers import centre, random_parameters, spec, workers_in_this_proce
 from tests.system.processes import is_running
 from tests.workers import host_tasks
 from workers.environments import TaskError, describe_environment, make_host_task
+from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import Lanes
 from workers.host.policies import LanePolicies
 from workers.worker import make_worker
@@ -355,6 +356,8 @@ def test_actions_to_choose_from_are_numbers_and_a_task_without_a_descriptor_has_
         ("step", lambda self, action: (0.0, 1.0), r"step returned 2 values; it must return \(observation, reward"),
         ("step", lambda self, action: 1 / 0, "cannot do a step: ZeroDivisionError"),
         ("step", None, "cannot do a step"),
+        ("step", lambda self, action: ([0.0] * 3, 1.0, False, False, None), "step returned the info None; it must be"),
+        ("reset", lambda self, seed: ([0.0] * 3, None), "reset returned the info None; it must be a mapping"),
         ("options", {"wind": 3}, "option 'wind' = 3 is neither an Option nor a tuple"),
     ],
 )
@@ -362,6 +365,38 @@ def test_a_class_that_contradicts_itself_is_refused(name, value, problem, monkey
     monkeypatch.setattr(host_tasks.Drift, name, value, raising=False)
     with pytest.raises(TaskError, match=rf"^{DRIFT}.*{problem}"):
         describe_environment(DRIFT)
+
+
+class Aliased(host_tasks.Drift):
+    """Its descriptor is an array that it goes on changing, and it changes its actions."""
+
+    descriptor_size = 1
+
+    def reset(self, seed):
+        self.far = np.zeros(1, np.float32)
+        return super().reset(seed)
+
+    def step(self, action):
+        np.clip(action, -0.25, 0.25, out=action)
+        self.far += 1.0
+        return super().step(action)
+
+    def descriptor(self):
+        return self.far
+
+
+def test_arrays_of_the_object_are_copied_and_it_gets_arrays_of_its_own():
+    environment = HostEnvironment(make_host_task(f"python:{__name__}:Aliased", {}))
+    environment.reset(0)
+    seen = []
+    for _ in range(3):
+        environment.step(np.float32([0.1]))
+        seen.append(environment.descriptor())
+    assert np.concatenate(seen).tolist() == [1.0, 2.0, 3.0]
+    given = np.full((2, 1), 0.9, np.float32)
+    for action in unchanged(given):
+        environment.step(action)
+    assert (given == np.float32(0.9)).all()
 
 
 def test_a_constructor_must_not_change_what_a_run_takes_from_the_class(monkeypatch):

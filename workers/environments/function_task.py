@@ -90,6 +90,8 @@ def describe(path: str) -> TaskSpec:
     function, name = import_named(path, "function"), PREFIX + path
     if not callable(function):
         raise TaskError(f"{name} is no function, but {function!r}")
+    if inspect.isclass(function) and not any("__call__" in vars(base) for base in function.__mro__):
+        raise TaskError(f"{name} is a class without __call__, so its objects are no functions")
     if not hasattr(function, "parameters"):
         raise TaskError(
             f"{name} has no attribute parameters; workers/environments/function_task.py lists what a function may have"
@@ -149,7 +151,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> FunctionTask:
 def _number(value: Any, name: str) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         forgotten = "; is a `return` missing?" if value is None else ""
         raise TaskError(f"{name} returned the fitness {value!r}; it must be a number{forgotten}") from None
 
@@ -162,16 +164,21 @@ def _descriptor(function: Any, parameters: ParameterSpec) -> tuple[Any, Any]:
     return parameters.names[:SHOWN], bounds
 
 
+def _plain(pair: Any) -> Any:
+    """A pair with Python's numbers in the place of NumPy's."""
+    return tuple(x.item() if isinstance(x, np.generic) else x for x in pair) if isinstance(pair, tuple) else pair
+
+
 def _parameters(function: Any) -> tuple[ParameterSpec | None, list[str]]:
     """Parameters that a function declares, and problems of the declaration."""
     given = function.parameters
-    if type(given) is int:
+    if isinstance(given, int | np.integer) and not isinstance(given, bool):
         given = tuple(f"x{index}" for index in range(given))
     if isinstance(given, tuple):
         given = dict.fromkeys(given)
     if not isinstance(given, Mapping) or not given or not all(isinstance(name, str) for name in given):
         return None, [f"parameters = {given!r} is not a mapping from names to bounds, nor a tuple of names or a number"]
-    bounds = tuple(FREE if pair is None else pair for pair in given.values())
+    bounds = tuple(FREE if pair is None else _plain(pair) for pair in given.values())
     wrong = wrong_pairs("parameters", tuple(pair for pair in bounds if pair != FREE))
     if wrong:
         return None, wrong

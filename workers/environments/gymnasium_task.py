@@ -154,7 +154,7 @@ def _is(space: Any, kind: str) -> bool:
 def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:
     """(size of an observation, function from an observation to numbers)."""
     if _is(space, "Box"):
-        return int(np.prod(space.shape)), np.asarray
+        return _size(task, "observations", space), np.asarray
     if _is(space, "Discrete"):
         values = np.arange(space.n) + space.start
         return int(space.n), lambda observation: values == observation
@@ -167,6 +167,7 @@ def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:
 def _acted(task: str, space: Any) -> Callable[[Any], Any]:
     """Function from actions of a policy [L, A] to actions of an environment."""
     if _is(space, "Box"):
+        _size(task, "actions", space)
         bounded = within_bounds(np.stack([space.low.reshape(-1), space.high.reshape(-1)], axis=-1), space.dtype)
         return lambda action_L_A: bounded(action_L_A).reshape(-1, *space.shape)
     if _is(space, "Discrete"):
@@ -176,6 +177,13 @@ def _acted(task: str, space: Any) -> Callable[[Any], Any]:
         f"{task} has actions of the space {space}; Box and Discrete are supported. Register the environment with a "
         "wrapper that takes one of these, such as gymnasium.wrappers.TransformAction"
     )
+
+
+def _size(task: str, what: str, box: Any) -> int:
+    size = int(np.prod(box.shape))
+    if not size:
+        raise TaskError(f"{task} has {what} of the space {box}, which are empty; a policy needs at least one number")
+    return size
 
 
 def _bounds(space: Any) -> list[tuple[float, float]]:

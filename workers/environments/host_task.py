@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,7 @@ class HostEnvironment:
         """Start an episode, and return its first observation [O]."""
         result = self._object.reset(seed=seed)
         observation, info = result if _is_pair(result) else (result, {})
+        self._require_info("reset", info)
         self._episode = HostEpisode(self._object, self._observed(observation), info, dict(info))
         if self._task.keeps_all:
             self._episode.observations.append(self._episode.observation_O)
@@ -102,6 +104,7 @@ class HostEnvironment:
             raise TaskError(f"{self._task.name}: step returned the reward {reward!r}; it must be a number") from None
         episode.observation_O, episode.steps = self._observed(observation), episode.steps + 1
         episode.info = ends[2] if len(ends) == 3 else {}
+        self._require_info("step", episode.info)
         episode.said |= episode.info
         if self._task.keeps_all:
             episode.observations.append(episode.observation_O)
@@ -115,7 +118,7 @@ class HostEnvironment:
 
     def descriptor(self) -> FloatArray:
         """Descriptor [B] of the episode if it ends now."""
-        found_B = np.asarray(self._task.descriptor(self._episode), np.float32).reshape(-1)
+        found_B = np.array(self._task.descriptor(self._episode), np.float32).reshape(-1)  # a copy, as in `_observed`
         if found_B.size != self._task.descriptor_size:
             raise TaskError(
                 f"{self._task.name}: the descriptor has {found_B.size} numbers, not {self._task.descriptor_size}"
@@ -133,6 +136,10 @@ class HostEnvironment:
     def success(self) -> bool:
         """Whether the episode has succeeded if it ends now."""
         return bool(self._task.success(self._episode))
+
+    def _require_info(self, method: str, info: Any) -> None:
+        if not isinstance(info, Mapping):
+            raise TaskError(f"{self._task.name}: {method} returned the info {info!r}; it must be a mapping")
 
     def _observed(self, observation: Any) -> FloatArray:
         # A copy, since an object may change the array that it has returned.
@@ -181,17 +188,25 @@ def try_out(task: HostTask, action_size: int) -> set[str]:
 
 def within_bounds(bounds: Any, dtype: Any = np.float32) -> Callable[[FloatArray], NDArray[Any]]:
     """Function from actions of a policy to actions between bounds: -1 and 1 become the bounds, and what is beyond is
-    clipped. A bound that is infinite clips nothing, and its dimension is not scaled.
+    clipped; whole numbers are rounded. A bound that is infinite clips nothing, and its dimension is not scaled.
 
     Args:
         bounds: (low, high) of each dimension, or of all.
     """
-    low_A, high_A = np.asarray(bounds, np.float32).reshape(-1, 2).T
+    pairs_A_2 = np.asarray(bounds).reshape(-1, 2)
+    low_A, high_A = pairs_A_2.astype(np.float32).T
     is_finite_A = np.isfinite(low_A) & np.isfinite(high_A)
     with np.errstate(invalid="ignore", over="ignore"):
         middle_A = np.where(is_finite_A, 0.5 * low_A + 0.5 * high_A, 0.0).astype(np.float32)
         half_A = np.where(is_finite_A, 0.5 * high_A - 0.5 * low_A, 1.0).astype(np.float32)
-    return lambda action_L_A: np.clip(middle_A + half_A * action_L_A, low_A, high_A).astype(dtype, copy=False)
+    if np.dtype(dtype) == np.float32:
+        return lambda action_L_A: np.clip(middle_A + half_A * action_L_A, low_A, high_A)
+    # The bounds of other types need not be numbers of float32, nor those of 64-bit integers of float64.
+    least_A = [np.nextafter(float(x), math.inf) if float(x) < x else x for x in pairs_A_2[:, 0].tolist()]
+    most_A = [np.nextafter(float(x), -math.inf) if float(x) > x else x for x in pairs_A_2[:, 1].tolist()]
+    nearest = np.rint if np.issubdtype(dtype, np.integer) else np.asarray
+    between = partial(np.clip, a_min=np.array(least_A, np.float64), a_max=np.array(most_A, np.float64))
+    return lambda action_L_A: between(nearest((middle_A + half_A * action_L_A).astype(np.float64))).astype(dtype)
 
 
 def chosen(action_L_A: FloatArray) -> list[int]:
@@ -200,10 +215,10 @@ def chosen(action_L_A: FloatArray) -> list[int]:
 
 
 def unchanged(action_L_A: FloatArray) -> FloatArray:
-    """Actions of a policy as they are."""
-    return action_L_A
+    """Actions of a policy as they are, in arrays that the object may change."""
+    return action_L_A.copy()
 
 
 def _is_pair(result: Any) -> bool:
     """Whether a reset has returned (observation, info), as those of Gymnasium do."""
-    return isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping)
+    return isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping | None)

@@ -43,7 +43,8 @@ class Caller:
     def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
         """(fitness, descriptor [B]). Raises CallFailedError if the call raised, ended its process, or took too long."""
         if self._child is None:
-            self._child = Child("workers.host.caller", os.environ | same_imports(), *self._given)
+            self._child = Child("workers.host.caller", os.environ | same_imports())
+            self._child.ask(*self._given)
             try:
                 self._answer(START_S, f"its process did not start within {START_S:g} s")
             except CallFailedError:
@@ -62,12 +63,12 @@ class Caller:
         assert self._child is not None, "the process has been started"
         try:
             answer = self._child.answer(limit_s)
-        except TimeoutError:
-            self.close()
-            raise CallFailedError(late) from None
-        except LostProcessError as lost:
+        except BaseException as error:
             self._child = None
-            raise CallFailedError(f"the call ended its process with {lost}") from None
+            if isinstance(error, TimeoutError | LostProcessError):
+                why = late if isinstance(error, TimeoutError) else f"the call ended its process with {error}"
+                raise CallFailedError(why) from None
+            raise
         if isinstance(answer, RaisedError):
             raise CallFailedError(answer.message)
         return answer

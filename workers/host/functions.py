@@ -88,7 +88,8 @@ def _called(
             fitness, descriptor_B = called(parameters_D, seed)
             if np.isfinite(np.float32(fitness)) and np.isfinite(descriptor_B).all():
                 return fitness, descriptor_B, ""
-        why = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()} are not finite numbers"
+        values = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()}"
+        why = f"{values} are not finite numbers that float32 holds"
     except CallFailedError as error:
         why = str(error)
     except (Exception, SystemExit) as error:  # the user's code can raise anything

@@ -35,7 +35,7 @@ class LanePolicies:
         """
         self._spec, self._mean, self._std = spec, mean, std
         self._layers = _lane_layers(spec, parameters_L_D)
-        self._memory = initial_memory(np, spec.policy, len(parameters_L_D), 1)
+        self._first_memory = self._memory = initial_memory(np, spec.policy, len(parameters_L_D), 1)
         self._key = (
             None if action_keys_L_4 is None else action_keys_L_4.T[:, :, None]
         )  # [4, L, 1]: a word for each lane
@@ -43,10 +43,11 @@ class LanePolicies:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a policy's episode is invalid, not an error
     def __call__(self, observation_L_O: FloatArray, step: int) -> FloatArray:
-        """Actions [L, A] of a step, the steps counted from 0."""
+        """Actions [L, A] of a step, the steps counted from 0, where episodes begin, also again."""
         policy = self._spec.policy
         x_L_O = normalise(np, observation_L_O, self._mean, self._std, self._spec.observation_clip)
-        outputs, self._memory = act(np, policy, self._layers, self._memory, x_L_O[:, None])
+        memory = self._first_memory if step == 0 else self._memory
+        outputs, self._memory = act(np, policy, self._layers, memory, x_L_O[:, None])
         outputs_L = outputs[:, 0]
         if self._key is None:
             return action(np, policy.output, outputs_L)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ def task_named(name: str, options: Mapping[str, OptionValue]) -> TaskSpec:
     Raises:
         TaskError: there is no such task, it has no such option, or it is of a kind that is no such environment.
     """
-    if ":" not in name and name not in SHIPPED:
+    if not isinstance(name, str) or (":" not in name and name not in SHIPPED):
         raise TaskError(f"task = {name!r} is not shipped; choose among {', '.join(SHIPPED)}, brax:NAME or module:Class")
     if is_host_task(name):
         raise TaskError(f"task = {name!r} is a Python object, no task in JAX; step it by itself")
@@ -147,6 +147,12 @@ class Lanes:
             (self.steps_N, state.steps_N),
         ):
             mine[:] = given
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            f"environments of {self.task.name} hold machine code or processes, which cannot be copied or pickled; make "
+            "others, and give them with set_state what get_state returns"
+        )
 
     def close(self) -> None:
         """End the threads and processes."""

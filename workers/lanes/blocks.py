@@ -8,7 +8,7 @@ before it loads JAX, and the caller has loaded it in its own way.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -51,10 +51,11 @@ class Blocks:
         self._children: list[Child] = []
         environment = child_environment() | xla_cache_settings()
         try:
+            requests = []
             for start, end in pairwise(bounds):
-                lanes_of_it = (end - start, first if start == 0 else 0)
-                self._children.append(Child("workers.lanes.process", environment, name, dict(options), *lanes_of_it))
-            self._answers(self._children)
+                self._children.append(Child("workers.lanes.process", environment))
+                requests.append((self._children[-1], (name, dict(options), end - start, first if start == 0 else 0)))
+            self._answers(requests)
         except BaseException:
             self.close()
             raise
@@ -69,15 +70,12 @@ class Blocks:
 
     def step(self, action_N_A: NDArray[np.float32]) -> Seen:
         """Step all lanes."""
-        for child, start, end in zip(self._children, self._bounds[:-1], self._bounds[1:], strict=True):
-            child.ask("step", action_N_A[start:end])
-        return _joined(self._answers(self._children))
+        places = zip(self._children, pairwise(self._bounds), strict=True)
+        return _joined(self._answers([(child, ("step", action_N_A[slice(*place)])) for child, place in places]))
 
     def words(self) -> NDArray[np.uint32]:
         """Words of the carries of all lanes, [N, words]."""
-        for child in self._children:
-            child.ask("words")
-        return _joined(self._answers(self._children))
+        return _joined(self._answers([(child, ("words",)) for child in self._children]))
 
     def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
         """Set the carries of some lanes, in increasing order."""
@@ -91,20 +89,25 @@ class Blocks:
     def _shared(self, kind: str, lane_M: NDArray[np.intp], given_M: NDArray) -> list[Any]:
         """Answers of the processes that have some of the lanes."""
         cuts = np.searchsorted(lane_M, self._bounds)
-        asked = []
+        requests = []
         for child, start, low, high in zip(self._children, self._bounds[:-1], cuts[:-1], cuts[1:], strict=True):
             if low < high:
-                child.ask(kind, lane_M[low:high] - start, given_M[low:high])
-                asked.append(child)
-        return self._answers(asked)
+                requests.append((child, (kind, lane_M[low:high] - start, given_M[low:high])))
+        return self._answers(requests)
 
-    def _answers(self, children: Iterable[Child]) -> list[Any]:
-        """Answers of processes. Raises TaskError with what the task's code raised, or LostProcessError."""
+    def _answers(self, requests: Sequence[tuple[Child, tuple[Any, ...]]]) -> list[Any]:
+        """Answers of processes to one request each. Raises TaskError with what the task's code raised, or
+        LostProcessError; after that, and after an interruption, the processes have ended."""
         try:
-            answers = [child.answer() for child in children]
-        except LostProcessError as lost:
+            for child, request in requests:
+                child.ask(*request)
+            answers = [child.answer() for child, _ in requests]
+        except BaseException as error:
+            self.close()
+            if not isinstance(error, LostProcessError):
+                raise
             raise LostProcessError(
-                f"the process in which xla computes {self._name} has ended with {lost}; make the environments anew"
+                f"the process in which xla computes {self._name} has ended with {error}; make the environments anew"
             ) from None
         for answer in answers:
             if isinstance(answer, RaisedError):
