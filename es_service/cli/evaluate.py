@@ -104,10 +104,10 @@ def evaluate(
             print_map_summary(console, run, results)
 
     def certified_rows(folder: Path) -> Iterator[dict[str, Any]]:
-        anything = best or centre or cells or top is not None
+        anything = best or centre or cells
         given: dict[str, Any] = {"episodes": episodes, "keep": keep, "by": by}
         certified = certify_run(
-            folder, best=best or not anything, centre=centre, cells=cells, top=(top or 0) if anything else None,
+            folder, best=best or not anything, centre=centre, cells=cells, top=0 if anything and top is None else top,
             generation=generation, workers=workers, on_notice=tell,
             **{name: value for name, value in given.items() if value is not None},
         )  # fmt: skip

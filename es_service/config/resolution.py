@@ -252,6 +252,10 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
     if pairs is not None and top is not None and top > pairs:
         what = f"{top} is more than search.pairs ({pairs}); try {pairs}, or null for all"
         problems.append(problem_of("search.shaping.count", top, what, suggestion=pairs))
+    if values.get("search.step_gate") and 1 in (pairs, top):
+        name = "search.pairs" if pairs == 1 else "search.shaping.count"
+        what = "1 pair has no halves, so that search.step_gate would allow no step; try 2"
+        problems.append(problem_of(name, 1, what, suggestion=2))
     if pairs is not None and gradient is not None and gradient > pairs:
         what = f"{gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
         problems.append(problem_of("compute.gradient_block_pairs", gradient, what, suggestion=pairs))

@@ -109,7 +109,8 @@ def certify_run(
             top = TOP if config.map.enabled else 0
         chosen = candidates(run, best=best, centre=centre, cells=cells, every=False, top=top, generation=generation)
         if not chosen:
-            raise NotInRunError(f"{run.folder}: there is no policy to certify; its map is empty", run=run.folder)
+            why = "its map is empty" if top else "no candidate is named"
+            raise NotInRunError(f"{run.folder}: there is no policy to certify; {why}", run=run.folder)
         with _engine(config, on_notice) as engine:
             number = store.next_certification
             certified = _certify(engine, config, _different(chosen), number, episodes, keep, by)

@@ -43,6 +43,7 @@ from es_service.search.algorithms.base import NO_CELL, FitnessWeight
 from es_service.search.algorithms.starts import elite_novelty
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.observation_statistics import no_observations
+from es_service.search.state_parts import changes, from_parts
 from es_service.search.steps import fresh_state
 from es_service.store import reader
 from es_service.store.beginning import SEVERAL, Beginning
@@ -132,6 +133,10 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
         }
     if "search.parent_statistics" in changed and constants["search.parent_statistics"] == "global":
         parts = _without_elite_statistics(parts)
+    known = from_parts(parts)
+    begun = ALGORITHMS[config.search.algorithm](config).extra
+    own = changes({**begun, **known}, known)  # what only the changed settings need begins as in a new run
+    parts = {**parts, **{name: arrays for name, arrays in own.items() if arrays is not None}}
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     history, evaluations = (_in_pieces(read, origin, at) for read in (reader.read_history, reader.read_evaluations))
     return _lineage(origin, at), Beginning(history, parts, platforms, newest=at, evaluations=evaluations)

@@ -122,7 +122,9 @@ def more(status: RunStatus) -> dict[str, float | None]:
     """Settings with which a finished run can continue; empty if it is not finished."""
     if status.row is None:
         return {}
-    reached = {TARGET: None} if status.certified else {}
+    reached: dict[str, float | None] = {TARGET: None} if status.certified else {}
+    if reached and not status.limits:
+        reached["generations"] = 2 * max(1, status.row["generation"])  # otherwise nothing would end the run
     return {f"budget.{key}": value for key, value in (reached | raised(status.limits, status.row)).items()}
 
 

@@ -144,6 +144,8 @@ def _session(
             raise explained(error, folder, f"writing {CONFIG}") from error
         if reason := target_reached(folder, config.budget.target_certified, config.task.fitness):
             return config, Outcome(open_run(folder), reason)
+        if targets.due(folder, config)(store.last_history()):
+            return config, Outcome(open_run(folder), targets.TO_CERTIFY)
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, folder, config)
             told = listener.on_notice, listener.on_compile

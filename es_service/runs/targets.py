@@ -34,18 +34,28 @@ def until_due(
 ) -> Callable[[Mapping[str, Any]], object]:
     """`on_generation`, whose answer is a Stop once the best centre is to be certified.
 
-    That is when its stored fitness reaches the target and exceeds that of every best centre that was certified before.
+    Args:
+        folder, config: as in `due`.
     """
-    target = config.budget.target_certified
-    if target is None:
-        return on_generation
-    certified = [policy for policy in certified_policies(folder) if policy.episodes.count >= EPISODES]
-    tested = [policy.stored_fitness for policy in certified if policy.name == BEST]
-    most = max((fitness for fitness in tested if fitness is not None), default=-math.inf)
+    is_due = due(folder, config)
 
     def answer(row: Mapping[str, Any]) -> object:
         given = on_generation(row)
-        is_due = row["best_fitness"] >= target and row["best_fitness"] > most
-        return Stop(TO_CERTIFY) if is_due and not isinstance(given, Stop) else given
+        return Stop(TO_CERTIFY) if not isinstance(given, Stop) and is_due(row) else given
 
     return answer
+
+
+def due(folder: Path, config: RunConfig) -> Callable[[Mapping[str, Any] | None], bool]:
+    """Function that says of a row of the history whether the best centre is to be certified.
+
+    That is when its stored fitness reaches the target and exceeds that of every best centre that was certified before.
+    It is so after an interruption, too: a session begins with the certification to which the one before did not come.
+    """
+    target = config.budget.target_certified
+    if target is None:
+        return lambda row: False
+    certified = [policy for policy in certified_policies(folder) if policy.episodes.count >= EPISODES]
+    tested = [policy.stored_fitness for policy in certified if policy.name == BEST]
+    most = max((fitness for fitness in tested if fitness is not None), default=-math.inf)
+    return lambda row: row is not None and row["best_fitness"] >= target and row["best_fitness"] > most

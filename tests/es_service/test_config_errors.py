@@ -109,6 +109,12 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
     assert line.startswith(f"{override.split('=')[0]}: {message.replace('...', 'is not allowed;')}")
 
 
+@pytest.mark.parametrize("overrides", [["search.pairs=1"], ["search.shaping.kind=top_pairs", "search.shaping.count=1"]])
+def test_halves_of_one_pair_are_refused(overrides):
+    (line,) = problems(MINIMAL, "search.step_gate=true", *overrides)
+    assert ": 1 pair has no halves, so that search.step_gate would allow no step; try 2" in line
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

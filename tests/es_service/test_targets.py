@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.runs import run_status
+from es_service.runs import run_status, targets
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import certified_policies, target_reached
 from es_service.runs.sweep import INSIDE, run_planned
@@ -58,6 +58,38 @@ def test_lucky_evaluations_do_not_end_a_run(whole, tmp_path):
     assert all(one.row()["return_mean"] < target <= one.stored_fitness for one in tested)
     assert outcome.reason == "the budget of 40 generations is spent"
     assert outcome.run.digest() == whole.digest()
+
+
+def test_a_run_that_was_interrupted_before_its_certification_begins_with_it(whole, tmp_path, monkeypatch):
+    target = float(whole.history["best_fitness"].iloc[0]) - 0.5
+    config = api.load_config(CONFIG, [f"budget.target_certified={target}"])
+    expected = api.run(config, tmp_path / "expected")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(targets, "certify_best", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            api.run(config, tmp_path / "run")
+    outcome = api.resume(tmp_path / "run")
+    assert (outcome.reason, outcome.run.digest()) == (expected.reason, expected.run.digest())
+
+
+def test_the_last_generation_of_a_budget_is_certified_too(whole, tmp_path):
+    config = api.load_config(CONFIG, ["budget.generations=1"])
+    api.run(config, tmp_path / "run")
+    outcome = api.resume(tmp_path / "run", ["budget.target_certified=-1000"])
+    assert "the target -1000 is reached" in outcome.reason
+    assert outcome.run.generation == 1
+
+
+def test_a_run_that_only_a_certified_target_has_ended_can_go_on(tmp_path):
+    config = CONFIG | {"budget": {"target_certified": -1000}}
+    run = api.run(api.load_config(config), tmp_path / "run").run
+    more = run_status.more(run_status.read_status(run))
+    assert more == {"budget.target_certified": None, "budget.generations": 2}
+    assert api.resume(run.folder, more).run.generation == 2
 
 
 def test_a_target_out_of_reach_certifies_nothing_and_the_budget_ends_the_run(whole, tmp_path):

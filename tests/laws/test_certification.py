@@ -289,9 +289,33 @@ def test_the_command_line_certifies_and_shows_it(finished, tmp_path):
     assert len((tmp_path / "out" / "certified.csv").read_text().splitlines()) == 1 + 5
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], (True, None)),
+        (["--top", "2"], (True, 2)),
+        (["--best"], (True, 0)),
+        (["--centre"], (False, 0)),
+        (["--centre", "--top", "3"], (False, 3)),
+    ],
+)
+def test_the_command_line_certifies_the_best_centre_and_elites_unless_others_are_named(
+    finished, monkeypatch, options, expected
+):
+    asked: list[dict] = []
+
+    def noted(folder, **given):
+        asked.append(given)
+        raise NotInRunError("noted")
+
+    monkeypatch.setattr(certification, "certify_run", noted)
+    CliRunner().invoke(app, ["evaluate", str(finished[0].folder), "--certify", *options])
+    assert [(given["best"], given["top"]) for given in asked] == [expected]
+
+
 def test_there_must_be_something_to_certify(finished):
     run, _ = finished
-    with pytest.raises(NotInRunError, match="no policy to certify"):
+    with pytest.raises(NotInRunError, match="no policy to certify; no candidate is named"):
         certify_run(run.folder, best=False, top=0)
     assert len(run.certified) == 4
 

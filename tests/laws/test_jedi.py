@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -136,6 +138,17 @@ def test_targets_change_after_their_generations_and_emitters_start_from_the_near
         assert (state.extra[TARGET] == targets[-1]).all()
     assert len(targets) == 3
     assert state.extra[VISITS].tolist() == [0, 7, 0, 0, 0, 1, 0, 0, 0]
+
+
+def test_while_the_map_is_empty_again_emitters_climb_fitness_and_nothing_counts_as_visited():
+    """As in a fork whose task has changed."""
+    _, method, state = jedi()
+    state = told(method, state, 0, (1.5, 5.5))
+    assert state.map is not None
+    forked = replace(state, map=empty_map(state.map.geometry))
+    assert method.start_cells(forked, 4) == {}
+    assert [one.objective.kind for one in method.ask(forked, 4)] == ["fitness", "fitness"]
+    assert told(method, forked, 4, (2.5, 2.5)).extra[VISITS].tolist() == [0, 0, 2, 0, 0, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize(("generations", "expected"), [(1, [0.3, 0.3]), (2, [1.0, 0.3, 1.0])])

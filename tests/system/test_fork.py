@@ -86,6 +86,23 @@ def test_searches_with_the_same_state_may_follow_one_another(tmp_path, algorithm
 
 
 @pytest.mark.parametrize(
+    ("before", "wanted"),
+    [
+        (["search.algorithm=memes"], "search.exploit_generations=2"),
+        (["search.algorithm=memes", "search.stagnation_generations=1"], "search.starts=least_tried"),
+        (["search.algorithm=me_es", "search.block_generations=2"], "search.cell_sampling=least_tried"),
+    ],
+)
+def test_a_setting_that_counts_begins_to_count_in_the_fork(tmp_path, before, wanted):
+    config = SMALL | {"search": {"pairs": 8, "evaluation_episodes": 1, "emitters": 2}}
+    parent = api.run(api.load_config(config, [*before, "budget.generations=3"]), tmp_path / "parent").run
+    child = api.fork(parent.folder, [wanted, "budget.generations=9"], out=tmp_path / "child").run
+    assert child.generation == 9
+    whole = api.fork(parent.folder, [wanted, "budget.generations=5"], out=tmp_path / "pieces").run
+    assert api.resume(whole.folder, ["budget.generations=9"]).run.digest() == child.digest()
+
+
+@pytest.mark.parametrize(
     ("override", "change"),
     [
         ("policy.hidden=[16]", "policy.hidden: [8] -> [16]"),

@@ -96,16 +96,18 @@ def jedi(config: RunConfig) -> Algorithm:
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         target_M_B = state.extra[TARGET]
-        if (generation - 1) % search.target_generations or state.map is None or np.isnan(target_M_B).any():
+        if state.map is None or not state.map.size:
+            return {}
+        if (generation - 1) % search.target_generations or np.isnan(target_M_B).any():
             return {}
         distance_M_N = np.linalg.norm(target_M_B[:, None] - state.map.descriptor_N_B, axis=-1)
         return {emitter: int(state.map.cell_N[nearest]) for emitter, nearest in enumerate(distance_M_N.argmin(axis=1))}
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        weight = target_weight(search, generation)
+        weight, is_empty = target_weight(search, generation), state.map is None or not state.map.size
         objectives = [
             FitnessObjective()
-            if np.isnan(target_B).any()
+            if is_empty or np.isnan(target_B).any()
             else NearnessObjective(descriptor=tuple(target_B.tolist()), weight=weight)
             for target_B in state.extra[TARGET]
         ]
@@ -114,7 +116,10 @@ def jedi(config: RunConfig) -> Algorithm:
         )
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
+        was_empty = state.map is None or not state.map.size  # also in a fork whose task has other places
         state, generation, extra = shared.tell(state, evaluations), evaluations[0].generation, dict(state.extra)
+        if was_empty:
+            extra[VISITS] = np.zeros_like(extra[VISITS])
         valid = [evaluation.descriptor_B for evaluation in evaluations if evaluation.valid]
         if valid:
             extra[VISITS] = extra[VISITS] + np.bincount(geometry.cells_of(np.array(valid)), minlength=geometry.size)

@@ -121,7 +121,7 @@ def memes(config: RunConfig) -> Algorithm:
         state = shared.tell(state, evaluations)
         entered_M = np.array([centre.cell != NO_CELL for centre in state.centres])
         counts = {STAGNANT: np.where(entered_M, 0, state.extra[STAGNANT] + 1)}
-        if AGE in state.extra:
+        if AGE in state.extra and evaluations[0].generation > 0:  # generation 0 evaluates what the others begin with
             counts[AGE] = state.extra[AGE] + 1
         return replace(state, extra=read_only({**state.extra, **counts}))
 
