@@ -11,12 +11,9 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import Any
 
-from es_service.protocol.parent import bound, start_child
+from es_service.protocol.parent import bound, guard_of, start_child
 from es_service.protocol.raised import raised
 from es_service.protocol.wire import framed, receive
-
-GUARD = ("/bin/sh", "-c", "read -r _; kill -9 0")
-"""Ends its process group once the other end of its input is closed, also by the end of the process that held it."""
 
 
 class LostProcessError(RuntimeError):
@@ -46,7 +43,7 @@ class Child:
             )
             unless_started.callback(_end, os.getpid(), self._socket, process)
             theirs.close()
-            guard = subprocess.Popen(GUARD, stdin=subprocess.PIPE, process_group=process.pid)
+            guard = guard_of(process)
             unless_started.pop_all()
         self._process = process
         self._end = weakref.finalize(self, _end, os.getpid(), self._socket, process, guard)

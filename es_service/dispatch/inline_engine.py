@@ -32,7 +32,7 @@ from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
-from es_service.protocol.parent import start_child
+from es_service.protocol.parent import guard_of, start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
@@ -76,6 +76,8 @@ class _Child:
     """Socket over which the child receives the sockets of its workers."""
     place: str = ""
     """The GPUs that it may use, as CUDA_VISIBLE_DEVICES names them."""
+    guard: subprocess.Popen[bytes] | None = None
+    """Ends the child's process group when the driver ends, for whatever reason."""
 
 
 @dataclass(eq=False)
@@ -293,6 +295,8 @@ def _end(child: _Child) -> tuple[str, str]:
     """Kill a child; returns how it ended and its last output."""
     _kill(child)
     code = child.process.wait()
+    if child.guard is not None:
+        child.guard.communicate()
     child.control.close()
     child.log.seek(max(0, child.log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
     last_words = child.log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
@@ -301,7 +305,7 @@ def _end(child: _Child) -> tuple[str, str]:
 
 
 def _kill(child: _Child) -> None:
-    """Kill a child and the processes that code of the user has started in it, which are in its session."""
+    """Kill a child and the processes that code of the user has started in it, which are in its process group."""
     if child.process.returncode is None:  # it has not been waited for, so that the number is still its own
         with suppress(ProcessLookupError):
             os.killpg(child.process.pid, signal.SIGKILL)
@@ -322,14 +326,16 @@ def _start_child(spec: bytes, undo: ExitStack, gpus: float, place: str) -> _Chil
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                start_new_session=True,
+                process_group=0,
             )
         )
     undo.callback(process.wait)
     undo.callback(process.kill)
+    guard = guard_of(process)
+    undo.callback(guard.communicate)
     ours.sendall(spec)
     ours.setblocking(False)  # if the child does not take its workers' sockets, they cannot be started
-    return _Child(process, log, ours, place)
+    return _Child(process, log, ours, place, guard)
 
 
 def _socket_pair() -> tuple[socket.socket, socket.socket]:

@@ -20,6 +20,8 @@ from queue import SimpleQueue
 
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
+_GUARD = ("/bin/sh", "-c", "read -r _; kill -9 0")
+"""Ends its process group once nobody holds the other end of its input any more."""
 LOOK_S = 0.2
 """Seconds between two looks for the parent, where the kernel does not tell of its death."""
 
@@ -55,6 +57,12 @@ def start_child(start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Pope
     started: Future[subprocess.Popen[bytes]] = Future()
     _starts(os.getpid()).put((start, started))
     return started.result()
+
+
+def guard_of(child: subprocess.Popen[bytes]) -> subprocess.Popen[bytes]:
+    """A process that ends a child, which must be the first of its process group, and all that it has started, when this
+    process ends, for whatever reason. `end_with` ends the child alone."""
+    return subprocess.Popen(_GUARD, stdin=subprocess.PIPE, process_group=child.pid)
 
 
 @cache

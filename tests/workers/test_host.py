@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -222,6 +226,25 @@ def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch)
         assert "within 1 s of computing (task.time_limit_s)" in notices[0]
         assert not is_running((tmp_path / "fault_process").read_text()), "what it has started ends with it"
     assert run.digest() == undisturbed
+
+
+def test_what_an_object_has_started_ends_with_a_driver_that_is_killed(tmp_path):
+    (tmp_path / "fault").write_text("hang")
+    config = config_of(f"python:{MODULE}:Slow", workers=1) | {"map": {"cells": [16]}}
+    program = f"from es_service import api; api.run({config!r}, {str(tmp_path / 'run')!r})"
+    environment = os.environ | {"HOST_FAULT": str(tmp_path / "fault")}
+    driver = subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.DEVNULL)
+    file, until = tmp_path / "fault_process", time.monotonic() + 120
+    try:
+        while not (file.exists() and file.read_text()):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    finally:
+        driver.kill()
+        driver.wait()
+    while is_running(file.read_text()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
 
 
 def test_what_cannot_be_computed_is_named_with_its_seed_so_that_it_can_be_run_alone(tmp_path):
