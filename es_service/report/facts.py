@@ -30,6 +30,8 @@ def verdict(data: RunData) -> str:
         return "No generation is finished yet, so there is nothing to show."
     generation, fitness = data.best
     where = "before any update" if generation == 0 else f"in generation {generation:,}"
+    if fitness == -np.inf:
+        return "The best centre is not known yet: with the settings of this fork, no centre has been evaluated."
     # A run of generation 0 alone has evaluated random weights and has not searched.
     alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
     episodes = data.constants["search.evaluation_episodes"]

@@ -24,7 +24,7 @@ from es_service.report.detours import detours
 from es_service.report.facts import number
 from es_service.report.markup import Frame, Markup, joined, packed, spread, tag
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.maps.geometry import Cvt, Grid
+from es_service.search.maps.geometry import Cvt, Grid, intervals
 
 Range = tuple[float, float]
 SMALL = 250
@@ -54,14 +54,14 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
         path = tag("g", class_="path")  # of a chosen cell
         content = [floor.ground(frame, data.names), *shapes, floor.walls_and_goal(frame, data.task), path]
         return _svg(content, *floor.size(frame)), "Each cell shows the fitness of its elite.", frame
+    if dimensions == 1:
+        text = "Each bar is a cell; its height is the fitness of its elite."
+        return _bars(map_, data.names, level_N, colours), text, None
     if isinstance(map_.geometry, Cvt):
         text = (
             f"Each point is an elite, at its place in {min(dimensions, PAIRED_DIMENSIONS)} of {dimensions} dimensions."
         )
         return _pairs(map_, data.names, level_N), text, None
-    if dimensions == 1:
-        text = "Each bar is a cell; its height is the fitness of its elite."
-        return _bars(map_, data.names, level_N, colours), text, None
     return _stacked(map_, data.names, level_N)
 
 
@@ -143,12 +143,11 @@ def _voronoi(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> li
 
 
 def _bars(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64], colours: Range) -> Markup:
-    assert isinstance(map_.geometry, Grid)
     low, high = spread([map_.fitness_N, np.array(colours)])
     frame = Frame(map_.geometry.bounds[0], (low, high), 64, 8, floor.WIDTH - 74, 220)
-    across, bottom = frame.across(map_.geometry.edges[0]).tolist(), frame.top + frame.height
+    across, bottom = frame.across(intervals(map_.geometry)).tolist(), frame.top + frame.height
     bars = [
-        _rectangle(cell, colour, across[cell], top, across[cell + 1], bottom)
+        _rectangle(cell, colour, across[cell][0], top, across[cell][1], bottom)
         for cell, colour, top in zip(map_.cell_N, level_N, frame.down(np.maximum(map_.fitness_N, low)), strict=True)
     ]
     return _svg([axis_lines(frame, names[0]), *bars], floor.WIDTH, bottom + 40)

@@ -24,7 +24,7 @@ from es_service.report.detours import detours
 from es_service.report.floor import is_plan
 from es_service.report.series import X_AXES
 from es_service.runs.view import Run
-from es_service.search.maps.geometry import Grid
+from es_service.search.maps.geometry import Grid, intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,11 +47,9 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
     """
     data = _data(run)
     if data.map is None or len(data.names) > 2:
-        what = (
-            "no behaviour map"
-            if data.map is None
-            else f"a map of {len(data.names)} dimensions, of which no plot is made"
-        )
+        what = f"a map of {len(data.names)} dimensions, of which no plot is made"
+        if data.map is None:
+            what = "no finished generation yet" if not data.history["generation"].size else "no behaviour map"
         raise NotInRunError(f"{data.folder} has {what}", run=data.folder)
     map_, geometry = data.map, data.map.geometry
     low, high = colours or value_range(map_.fitness_N)
@@ -150,9 +148,13 @@ def curves(
         against: `generation`, `env_steps` or `wall_clock_s`.
         group_by: config keys that group the runs; see `compare.grouped`.
 
-    Raises ConfigError for another column or axis, and for runs of different tasks.
+    Raises ConfigError for another column or axis, and for runs of different tasks, and NotInRunError for a run without
+    a finished generation.
     """
     all_data = [_data(source) for source in (runs if isinstance(runs, list | tuple) else [runs])]
+    for data in all_data:
+        if not data.history["generation"].size:
+            raise NotInRunError(f"{data.folder} has no finished generation yet", run=data.folder)
     for name, allowed in ((column, all_data[0].history), (against, X_AXES)):
         if name not in allowed or any(column not in data.history for data in all_data):
             raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
@@ -185,11 +187,10 @@ def _data(run: Source) -> RunData:
 
 def _bars(data: RunData) -> list[list[tuple[float, float]]]:
     assert data.map is not None
-    assert isinstance(data.map.geometry, Grid)
-    edges, floor = data.map.geometry.edges[0].tolist(), value_range(data.map.fitness_N)[0]
+    ends_N_2, floor = intervals(data.map.geometry)[data.map.cell_N].tolist(), value_range(data.map.fitness_N)[0]
     return [
-        [(edges[cell], floor), (edges[cell], fitness), (edges[cell + 1], fitness), (edges[cell + 1], floor)]
-        for cell, fitness in zip(data.map.cell_N.tolist(), data.map.fitness_N.tolist(), strict=True)
+        [(low, floor), (low, fitness), (high, fitness), (high, floor)]
+        for (low, high), fitness in zip(ends_N_2, data.map.fitness_N.tolist(), strict=True)
     ]
 
 

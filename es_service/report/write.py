@@ -74,7 +74,9 @@ def write_report(
     elsewhere = WayOut("report", "write it elsewhere", str(folder), out="FILE")
     page = run_page(data, evaluate or python_call(folder), replays)
     page = write_page(page, Path(out or folder / REPORT), [elsewhere])
-    return [page, *(write_figures([data], Path(figures)) if figures is not None else [])]
+    if figures is None or not data.history["generation"].size:
+        return [page]
+    return [page, *write_figures([data], Path(figures))]
 
 
 def write_comparison(

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from es_service.loop.parts import geometry_from_arrays, geometry_to_arrays
-from es_service.search.maps.geometry import Cvt, Grid, make_geometry
+from es_service.search.maps.geometry import Cvt, Grid, intervals, make_geometry
 from tests.es_service.map_examples import OBLONG, PLANE, SQUARE, map_config
 from tests.references import behaviour_map as reference
 
@@ -55,6 +55,18 @@ def test_grids_equal_the_reference_on_any_descriptor_and_on_every_edge(sides, da
         reference.cell_number(shape, reference.grid_index(bounds, shape, descriptor)) for descriptor in descriptors
     ]
     assert grid.cells_of(descriptors).tolist() == expected
+
+
+@given(places=st.lists(st.integers(-100, 300), min_size=1, max_size=9, unique=True))
+def test_intervals_have_the_places_of_their_cells(places):
+    """Of a grid and of a tessellation in one dimension."""
+    for geometry in (Grid(((-1.0, 3.0),), (len(places),)), Cvt(((-1.0, 3.0),), np.array(places)[:, None] / 100)):
+        ends_C_2 = intervals(geometry)
+        assert np.sort(ends_C_2.ravel())[[0, -1]].tolist() == [-1.0, 3.0]
+        assert (ends_C_2[:, 0] <= ends_C_2[:, 1]).all()
+        middle_C = ends_C_2.mean(axis=1)
+        wide_C = np.flatnonzero(np.diff(ends_C_2, axis=1)[:, 0] > 1e-9)
+        assert geometry.cells_of(middle_C[:, None])[wide_C].tolist() == wide_C.tolist()
 
 
 def test_cells_are_numbered_with_the_last_dimension_fastest():

@@ -176,6 +176,9 @@ def test_a_run_without_generations_is_refused(runs, tmp_path):
     execute(write_run(tmp_path / "run"), "DELETE FROM history")
     with pytest.raises(NotInRunError, match="has no finished generation yet"):
         comparison_page([runs[0], read_run(tmp_path / "run")])
+    with pytest.raises(NotInRunError, match="has no finished generation yet"):
+        plots.curves(tmp_path / "run", empty_figure().subplots())
+    assert write_report(tmp_path / "run", figures=tmp_path / "figures") == [tmp_path / "run" / "report.html"]
 
 
 @pytest.mark.slow
@@ -299,6 +302,8 @@ def test_plots_of_centres_and_curves(folders, runs, axes):
 @pytest.mark.slow
 def test_maps_of_other_dimensions_are_plotted_or_refused(tmp_path, axes):
     assert plots.behaviour_map(write_run(tmp_path / "one", task=task_with(1)), axes) is not None
+    line = write_run(tmp_path / "line", {"map.kind": "cvt", "map.cells": [30]}, task=task_with(1))
+    assert plots.behaviour_map(line, axes).get_array().size == 15
     cvt = write_run(tmp_path / "cvt", {"map.kind": "cvt", "map.cells": [30]}, task=task_with(2))
     assert plots.behaviour_map(cvt, axes).get_array().size == 15
     with pytest.raises(NotInRunError, match="a map of 3 dimensions"):

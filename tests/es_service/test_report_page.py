@@ -123,6 +123,7 @@ def test_a_data_script_cannot_be_left():
     ("dimensions", "settings", "shape"),
     [
         (1, {}, "rect"),
+        (1, {"map.kind": "cvt", "map.cells": [60]}, "rect"),
         (2, {}, "rect"),
         (2, {"map.kind": "cvt", "map.cells": [60]}, "polygon"),
         (3, {"map.cells": [4, 3, 2]}, "rect"),

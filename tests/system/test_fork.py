@@ -21,6 +21,8 @@ from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError
 from es_service.loop.parts import CELL_PREFIX
 from es_service.protocol.options import choice
+from es_service.report.data import read_run
+from es_service.report.facts import verdict
 from es_service.runs import checked_config, evaluation, lineage, sessions
 from es_service.runs.run_status import more, read_status
 from es_service.runs.session import dispatch_limits
@@ -412,3 +414,9 @@ def test_a_fork_with_another_fitness_forgets_the_best_of_before(finished, tmp_pa
     assert es("fork", finished[0], "--out", tmp_path / "a", "--set", "task.fitness=final", *more)[0] == 0
     history = open_run(tmp_path / "a").history
     assert history["best_fitness"].iloc[-1] == history["centre_fitness_mean"].iloc[31:].max()
+
+
+def test_before_its_first_generation_a_fork_that_forgets_has_no_best_centre_in_its_report(parent, tmp_path):
+    child = api.fork(parent.folder, ["task.options.start=corner"], out=tmp_path / "child", on_notice=[].append).run
+    assert child.generation == 6
+    assert verdict(read_run(child.folder)).startswith("The best centre is not known yet: with the settings")

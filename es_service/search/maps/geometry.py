@@ -134,6 +134,17 @@ class Cvt:
 Geometry = Grid | Cvt
 
 
+def intervals(geometry: Geometry) -> NDArray[np.float64]:
+    """(low, high) of each cell of a map of one dimension, [C, 2]."""
+    if isinstance(geometry, Grid):
+        edges = geometry.edges[0]
+        return np.stack([edges[:-1], edges[1:]], axis=1)
+    place_C, (low, high) = geometry.centroid_C_B[:, 0], geometry.bounds[0]
+    order = np.argsort(place_C, kind="stable")
+    edges = np.concatenate([[low], (place_C[order][:-1] + place_C[order][1:]) / 2, [high]])
+    return np.stack([edges[:-1], edges[1:]], axis=1)[np.argsort(order)]
+
+
 def make_geometry(config: MapConfig) -> Geometry:
     """The cells that a config specifies; they are the same for every seed, so that runs can be compared by cell."""
     if config.kind == "grid":
