@@ -600,8 +600,8 @@ CASES = [
         (
             "is another one in the second process",
             "workers/lanes/blocks.py",
-            "child.ask((kind, lane_M[low:high] - start, given_M[low:high]))",
-            "child.ask((kind, lane_M[low:high] - start - (start > 0), given_M[low:high]))",
+            "requests.append((child, (kind, lane_M[low:high] - start, given_M[low:high])))",
+            "requests.append((child, (kind, lane_M[low:high] - start - (start > 0), given_M[low:high])))",
         ),
     ),
     *cases(
