@@ -182,6 +182,6 @@ run(load_config({CONFIG | {"budget": {"generations": 100_000}}!r}), {str(tmp_pat
     with running(sys.executable, "-c", script) as process:
         wait_until(process, lambda: committed(tmp_path / "run") is not None)
         workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        assert len(workers) == 2
+        assert len(workers) == 4, "two, and their guards"
         assert all(map(is_running, workers))
     wait_for(lambda: not any(map(is_running, workers)), timeout_s=60.0)
