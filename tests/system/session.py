@@ -47,7 +47,7 @@ def finish(folder: Path, *, config: dict | None = None, kill: dict | None = None
 def _main(folder: str, config: dict | None, kill: dict | None) -> None:
     from es_service import api
 
-    seen = 0
+    seen, killers = 0, []
 
     def die() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -71,13 +71,16 @@ def _main(folder: str, config: dict | None, kill: dict | None) -> None:
                 time.sleep(0)
             die()
 
-        threading.Thread(target=later, daemon=True).start()
+        killers.append(threading.Thread(target=later, daemon=True))
+        killers[0].start()
         armed.wait()
 
     if config is None:
         api.resume(folder, hook=hook)
     else:
         api.run(api.load_config(config), folder, hook=hook)
+    for killer in killers:
+        killer.join()  # it may have had no core until the session was over
 
 
 if __name__ == "__main__":
