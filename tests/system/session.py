@@ -47,7 +47,8 @@ def finish(folder: Path, *, config: dict | None = None, kill: dict | None = None
 def _main(folder: str, config: dict | None, kill: dict | None) -> None:
     from es_service import api
 
-    seen, killers = 0, []
+    seen = 0
+    killers: list[threading.Thread] = []
 
     def die() -> None:
         os.kill(os.getpid(), signal.SIGKILL)

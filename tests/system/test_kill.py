@@ -57,7 +57,10 @@ def checkpoint_in_progress(folder) -> bool:
     The WAL index keeps, at bytes 96 and 128, how many frames are known to be in the database and how many a checkpoint
     has begun to move there (SQLite file format, "WAL-index header").
     """
-    index = (folder / "run.db-shm").read_bytes()
+    try:
+        index = (folder / "run.db-shm").read_bytes()
+    except FileNotFoundError:  # the session had ended before
+        return False
     moved, attempted = (int.from_bytes(index[at : at + 4], "little") for at in (96, 128))
     return attempted > moved
 
