@@ -77,7 +77,7 @@ def create_run(
     ):
         begun = store.generation
         try:
-            until = targets.until_due(on_generation, folder, config)
+            until = targets.until_due(on_generation, targets.due(folder, config))
             outcome = work(config, store, until, listener.on_notice, listener.on_compile, caller=listener.caller)
         except StartError as error:
             if store.generation != begun:
@@ -144,9 +144,9 @@ def _session(
             raise explained(error, folder, f"writing {CONFIG}") from error
         if reason := target_reached(folder, config.budget.target_certified, config.task.fitness):
             return config, Outcome(open_run(folder), reason)
-        if targets.due(folder, config)(store.last_history()):
+        if (is_due := targets.due(folder, config))(store.last_history()):
             return config, Outcome(open_run(folder), targets.TO_CERTIFY)
         with listener.shown(folder) as on_generation:
-            until = targets.until_due(on_generation, folder, config)
+            until = targets.until_due(on_generation, is_due)
             told = listener.on_notice, listener.on_compile
             return config, work(config, store, until, *told, strict=strict, caller=listener.caller)

@@ -30,14 +30,13 @@ def certify_best(folder: Path, config: RunConfig, on_notice: Callable[[str], Non
 
 
 def until_due(
-    on_generation: Callable[[Mapping[str, Any]], object], folder: Path, config: RunConfig
+    on_generation: Callable[[Mapping[str, Any]], object], is_due: Callable[[Mapping[str, Any]], bool]
 ) -> Callable[[Mapping[str, Any]], object]:
     """`on_generation`, whose answer is a Stop once the best centre is to be certified.
 
     Args:
-        folder, config: as in `due`.
+        is_due: what `due` returns.
     """
-    is_due = due(folder, config)
 
     def answer(row: Mapping[str, Any]) -> object:
         given = on_generation(row)

@@ -104,7 +104,7 @@ def jedi(config: RunConfig) -> Algorithm:
         return {emitter: int(state.map.cell_N[nearest]) for emitter, nearest in enumerate(distance_M_N.argmin(axis=1))}
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        weight, is_empty = target_weight(search, generation), state.map is None or not state.map.size
+        weight, is_empty = target_weight(search, generation), _has_no_elites(state)
         objectives = [
             FitnessObjective()
             if is_empty or np.isnan(target_B).any()
@@ -116,7 +116,7 @@ def jedi(config: RunConfig) -> Algorithm:
         )
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-        was_empty = state.map is None or not state.map.size  # also in a fork whose task has other places
+        was_empty = _has_no_elites(state)  # also in a fork whose task has other places
         state, generation, extra = shared.tell(state, evaluations), evaluations[0].generation, dict(state.extra)
         if was_empty:
             extra[VISITS] = np.zeros_like(extra[VISITS])
@@ -133,6 +133,10 @@ def jedi(config: RunConfig) -> Algorithm:
     dimensions = len(config.map.bounds)
     extra = {TARGET: np.full((search.emitters, dimensions), np.nan), VISITS: np.zeros(geometry.size, np.int64)}
     return replace(shared, start_cells=start_cells, ask=ask, tell=tell, extra=extra)
+
+
+def _has_no_elites(state: SearchState) -> bool:
+    return state.map is None or not state.map.size
 
 
 def target_weight(search: JediSettings, generation: int) -> float:
