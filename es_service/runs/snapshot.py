@@ -35,6 +35,7 @@ from es_service.store import reader
 from es_service.store.schema import RunMeta
 from workers.policies.outputs import action
 from workers.policies.policy import act, initial_memory, normalise, split_layers
+from workers.policies.recurrent import dense_of_each
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,6 +46,9 @@ class Policy:
     """A trained controller that needs only NumPy: observation [O] or [..., O] -> action [..., A].
 
     It includes the observation statistics that it runs with. A policy with a memory is called through `start`.
+
+    On one machine, an observation has the same action, bit for bit, alone and among others, whatever their memory
+    layout; on a processor of another kind, the last bits of an action may differ.
     """
 
     spec: PolicySpec
@@ -80,7 +84,7 @@ class Policy:
     def act(self, observation: Any, memory: FloatArray | None = None) -> tuple[FloatArray, FloatArray | None]:
         """(action, memory after the step); the memory before it is None at the start of an episode. A policy without a
         memory has None always."""
-        observation = np.asarray(observation, np.float32)
+        observation = np.asarray(observation, np.float32, order="C")
         size = self.spec.widths[0]
         if observation.shape[-1:] != (size,):
             raise ValueError(
@@ -88,7 +92,7 @@ class Policy:
             )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
         before = initial_memory(np, self.spec, *x.shape[:-1]) if memory is None else memory
-        outputs, after = act(np, self.spec, split_layers(self.spec, self.parameters_D), before, x)
+        outputs, after = act(np, self.spec, split_layers(self.spec, self.parameters_D), before, x, dense_of_each)
         return action(np, self.spec.output, outputs), after
 
 

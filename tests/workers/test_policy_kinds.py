@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -129,13 +132,35 @@ def test_a_policy_with_a_memory_is_called_through_start():
     seen_T_N_O = np.random.default_rng(0).normal(size=(4, 3, 2))
     together, alone = policy.start(), [policy.start() for _ in range(3)]
     for seen_N_O in seen_T_N_O:
-        np.testing.assert_allclose(
-            together(seen_N_O), [act(x) for act, x in zip(alone, seen_N_O, strict=True)], atol=1e-6
-        )
+        np.testing.assert_array_equal(together(seen_N_O), [act(x) for act, x in zip(alone, seen_N_O, strict=True)])
     again = policy.start()
     assert not np.allclose(again(seen_T_N_O[0]), together(seen_T_N_O[0])), "the other one remembers"
     plain = recurrent(PolicySpec((2, 1)))
     np.testing.assert_array_equal(plain.start()([0.1, 0.2]), plain([0.1, 0.2]))
+
+
+def require_bits_of_each() -> None:
+    """An observation has the same action alone, in a batch, and as every second number of a longer array."""
+    for policy in (PolicySpec((2, 6, 2), "relu", "linear"), PolicySpec((29, 256, 8)), PolicySpec((7, 5, 3), memory=6)):
+        policy = recurrent(policy)
+        seen_N_2O = np.random.default_rng(0).normal(size=(50, 2 * policy.spec.widths[0])).astype(np.float32)
+        seen_N_O = np.ascontiguousarray(seen_N_2O[:, ::2])
+        each_N_A = np.stack([policy.start()(seen_O) for seen_O in seen_N_O])
+        for same_N_O in (seen_N_O, seen_N_2O[:, ::2], np.asfortranarray(seen_N_O)):
+            assert policy.start()(same_N_O).tobytes() == each_N_A.tobytes()
+            assert policy.start()(same_N_O[7]).tobytes() == each_N_A[7].tobytes()
+        assert policy.start()(seen_N_O.reshape(5, 10, -1)).tobytes() == each_N_A.tobytes()
+        assert policy.start()(seen_N_O[:0]).shape == (0, each_N_A.shape[1])
+
+
+@pytest.mark.parametrize("kernels", [None, "Haswell"])
+def test_the_bits_of_an_action_do_not_depend_on_other_observations(kernels):
+    """With the kernels that OpenBLAS has for this processor, and those for AVX2, where matrices and vectors differ."""
+    program = "from tests.workers.test_policy_kinds import require_bits_of_each; require_bits_of_each()"
+    if kernels is None:
+        require_bits_of_each()
+    else:
+        subprocess.run([sys.executable, "-c", program], env=os.environ | {"OPENBLAS_CORETYPE": kernels}, check=True)
 
 
 def test_an_episode_of_xla_threads_the_memory_as_numpy_does():

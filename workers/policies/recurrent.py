@@ -13,6 +13,15 @@ def dense(x: Any, weights: Any, biases: Any) -> Any:
     return x @ weights if biases is None else x @ weights + biases
 
 
+def dense_of_each(x: Any, weights: Any, biases: Any) -> Any:
+    """`dense` in NumPy, as a product for each row of x [..., in].
+
+    The libraries that NumPy multiplies with have one kernel for a vector and another one for a matrix. On many
+    processors the two round differently, so a row of one large product would differ from the product of that row.
+    """
+    return dense(x[..., None, :], weights, biases)[..., 0, :]
+
+
 Dense = Callable[[Any, Any, Any], Any]
 """Function (x, weights, biases or None) -> outputs of a layer before its activation."""
 
