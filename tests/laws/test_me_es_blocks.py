@@ -140,6 +140,16 @@ def test_of_several_initial_centres_each_elite_leaves_out_its_own_entry():
     assert novelty_N.tolist() == [10.0, 10.0, 15.0, 15.0]
 
 
+@pytest.mark.parametrize("asked", [[0, 1, 2], [1, 0, 2], [2, 1, 0], [2, 0, 1]])
+def test_an_elite_s_own_entry_is_no_neighbour_in_whatever_order_a_search_asks_for_centres(asked):
+    places = {0: 0.0, 1: 10.0, 2: 30.0}
+    map_ = replace(line([0, 10, 30], generations=[4, 4, 4]), centre_N=np.arange(3))
+    archive = extended(empty_archive(1), [5.0], 3, 0)
+    for centre in asked:
+        archive = extended(archive, [places[centre]], 4, centre)
+    assert elite_novelty(map_, archive, config_of(neighbours=1).novelty).tolist() == [5.0, 5.0, 20.0]
+
+
 def state_at(map_):
     return replace(first_state([np.zeros(3, np.float32)], 1, 0.0, map_), archive=archive_of(map_))
 

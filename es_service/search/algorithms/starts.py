@@ -85,10 +85,10 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
 def _entries_of_elites(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
     """Index of each elite's own entry in the novelty archive, [N]; -1 for an elite without one.
 
-    The search relies on the order of the entries: by generation and, within a generation, by centre.
+    Entries are in the order of the asks, which need not be that of the centres.
     """
     centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
     entry_N, elite_N = (entries.generation_N * centres + entries.centre_N for entries in (archive, map_))
-    found_N = np.searchsorted(entry_N, elite_N)
-    is_there_N = np.append(entry_N, -1)[found_N] == elite_N
-    return np.where(is_there_N, found_N, -1)
+    order = np.argsort(entry_N, kind="stable")
+    found_N = np.append(order, -1)[np.searchsorted(entry_N, elite_N, sorter=order)]
+    return np.where(np.append(entry_N, -1)[found_N] == elite_N, found_N, -1)
