@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,8 @@ from es_service.protocol.recipes import Recipes
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
 
 LEARNING_RATE = "search.step.learning_rate"
+SHOWN_CELLS = 5
+"""Most cells that a message names."""
 
 
 def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation_size: int, generation: int) -> None:
@@ -27,7 +29,7 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation
             returned = "an empty tuple" if asks == () else type(asks).__name__ + kinds
             return f"`ask` returned {returned}; it must return a tuple of one or more Ask or PolicyAsk"
         indices = [ask.centre for ask in asks if isinstance(ask, Ask)]
-        known = all(isinstance(index, int | np.integer) and 0 <= index < len(state.centres) for index in indices)
+        known = all(_is_index(index, len(state.centres)) for index in indices)
         if not known or len(set(indices)) < len(indices):
             return f"the asks are for the centres {indices}; each of the {len(state.centres)} may occur once"
         size = state.centres[0].centre_D.size
@@ -48,13 +50,69 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation
         raise EvaluationError(f"generation {generation}: {problem}", field="search.algorithm")
 
 
-def require_state(state: object, function: str, generation: int) -> None:
-    """Raise an EvaluationError if a function of a search, a user's perhaps, has not returned a state."""
+def require_start_cells(cells: object, state: SearchState, generation: int) -> dict[int, int]:
+    """The cells from whose elites centres restart, by index of the centre.
+
+    Raises:
+        EvaluationError: a search, a user's perhaps, names a centre or an elite that there is not.
+    """
+    if not isinstance(cells, Mapping):
+        what = f"returned {type(cells).__name__}; it must return a mapping from indices of centres to cells"
+        raise _wrong("start_cells", what, generation)
+    if not all(_is_index(index, len(state.centres)) for index in cells):
+        what = f"names the centres {list(cells)}; the indices of centres are 0 to {len(state.centres) - 1}"
+        raise _wrong("start_cells", what, generation)
+    named = require_parents(list(cells.values()), state, generation, "start_cells")
+    return {int(index): cell for index, cell in zip(cells, named, strict=True)}
+
+
+def require_parents(cells: object, state: SearchState, generation: int, function: str = "parents") -> list[int]:
+    """Cells whose elites a search needs.
+
+    Raises:
+        EvaluationError: a search, a user's perhaps, names something else than filled cells.
+    """
+    try:
+        cell_N = np.asarray(cells)
+    except ValueError:  # sequences of different lengths
+        cell_N = np.zeros((), object)
+    are_whole = cell_N.ndim == 1 and (not cell_N.size or cell_N.dtype.kind in "iu")
+    if not isinstance(cells, Sequence | np.ndarray) or not are_whole:
+        what = f"returned {cells!r} as cells; it must return whole numbers, such as those of `map.cell_N`"
+        raise _wrong(function, what, generation)
+    filled = state.map.cell_N if state.map is not None else np.zeros(0, np.int64)
+    if missing := cell_N[~np.isin(cell_N, filled)].tolist():
+        there = f"{filled.size} cells of the map have one" if state.map is not None else "the run has no map"
+        named = ", ".join(map(str, missing[:SHOWN_CELLS])) + (" ..." if len(missing) > SHOWN_CELLS else "")
+        raise _wrong(function, f"names the cells {named}, which have no elite; {there}", generation)
+    return cell_N.tolist()
+
+
+def require_state(state: object, function: str, generation: int, centre: int | None = None, size: int = 0) -> None:
+    """Raise an EvaluationError if a function of a search, a user's perhaps, has not returned a state.
+
+    Args:
+        centre: index of the centre that the function was to change, which must still be there.
+        size: number of its parameters.
+    """
     if not isinstance(state, SearchState):
-        raise EvaluationError(
-            f"generation {generation}: `{function}` returned {type(state).__name__}; it must return a SearchState",
-            field="search.algorithm",
-        )
+        raise _wrong(function, f"returned {type(state).__name__}; it must return a SearchState", generation)
+    if centre is None:
+        return
+    if not centre < len(state.centres):
+        what = f"returned a state without centre {centre}, which it was called for; it has {len(state.centres)} centres"
+        raise _wrong(function, what, generation)
+    if problem := _not_floats(state.centres[centre].centre_D, (size,)):
+        raise _wrong(function, f"returned a state in which the parameters of centre {centre} {problem}", generation)
+
+
+def _wrong(function: str, what: str, generation: int) -> EvaluationError:
+    """The error of what a function of a search, a user's perhaps, has returned."""
+    return EvaluationError(f"generation {generation}: `{function}` {what}", field="search.algorithm")
+
+
+def _is_index(index: object, count: int) -> bool:
+    return isinstance(index, int | np.integer) and not isinstance(index, bool) and 0 <= int(index) < count
 
 
 def require_weights(weights_P: object, asked: Ask, generation: int) -> None:

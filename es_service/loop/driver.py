@@ -20,7 +20,9 @@ from es_service.loop.checks import (
     invalidate,
     require_asks,
     require_finite,
+    require_parents,
     require_some_finite,
+    require_start_cells,
     require_state,
     require_weights,
 )
@@ -187,10 +189,12 @@ def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
     if generation == 0:
         points = [make_centre(config, 0, centre.centre_D, state.observations, centre) for centre in begun.centres]
         return Proposal(0, begun, {}, (), points, ())
-    start_cells = algorithm.start_cells(begun, generation)
+    size = begun.centres[0].centre_D.size
+    start_cells = require_start_cells(algorithm.start_cells(begun, generation), begun, generation)
     for index, cell in start_cells.items():
         begun = algorithm.restart(begun, index, cell, elites(cell))
-    parents = elites.of(algorithm.parents(begun, generation))
+        require_state(begun, "restart", generation, index, size)
+    parents = elites.of(require_parents(algorithm.parents(begun, generation), begun, generation))
     asked = algorithm.ask(replace(begun, elites=parents), generation)
     require_asks(asked, begun, config.compute.chunk_pairs, search.task.observation_size, generation)
     points = [
@@ -269,7 +273,7 @@ def _step(
     stepped = proposal.search
     for ask, gradient_D in zip(asks, gradients, strict=True):
         stepped = algorithm.step(stepped, ask, gradient_D)
-        require_state(stepped, "step", generation)
+        require_state(stepped, "step", generation, ask.centre, gradient_D.size)
     # New centres are evaluated with the observation statistics of the generation's start.
     new_centres = [
         replace(centre, parameters_D=stepped.centres[ask.centre].centre_D)

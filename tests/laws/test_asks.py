@@ -145,3 +145,103 @@ def test_what_is_no_state_is_an_error_with_a_sentence(function, returned):
     generation, kind = {"step": 1, "tell": 0}[function], type(returned).__name__
     with pytest.raises(EvaluationError, match=f"generation {generation}: `{function}` returned {kind}; it must return"):
         run_in_memory(config, algorithm=algorithm)
+
+
+EVERY_CELL = list(range(400))
+"""All cells of the map, most of which are empty."""
+
+
+@pytest.mark.parametrize(
+    ("function", "returned", "sentence"),
+    [
+        ("start_cells", None, "returned NoneType; it must return a mapping from indices of centres to cells"),
+        ("start_cells", [(0, 3)], "returned list; it must return a mapping"),
+        ("start_cells", {2: 0}, r"names the centres \[2\]; the indices of centres are 0 to 1"),
+        ("start_cells", {-1: 0}, r"names the centres \[-1\]"),
+        ("start_cells", {0.0: 0}, r"names the centres \[0\.0\]"),
+        ("start_cells", {0: 400}, "names the cells 400, which have no elite; [12] cells of the map have one"),
+        ("start_cells", {0: -1}, "names the cells -1, which have no elite"),
+        ("start_cells", {0: 1.5}, r"returned \[1\.5\] as cells; it must return whole numbers"),
+        ("start_cells", {0: None}, r"returned \[None\] as cells"),
+        ("start_cells", {0: [3]}, r"returned \[\[3\]\] as cells"),
+        ("parents", None, "returned None as cells; it must return whole numbers"),
+        ("parents", 7, "returned 7 as cells"),
+        ("parents", {3, 4}, r"returned \{3, 4\} as cells"),
+        ("parents", "12", "returned '12' as cells"),
+        ("parents", ["a"], r"returned \['a'\] as cells"),
+        ("parents", [True], r"returned \[True\] as cells"),
+        ("parents", [[1], [2, 3]], r"returned \[\[1\], \[2, 3\]\] as cells"),
+        ("parents", EVERY_CELL, r"names the cells (\d+, ){4}\d+ \.\.\., which have no elite"),
+    ],
+)
+def test_centres_and_elites_that_are_not_there_are_an_error_with_a_sentence(function, returned, sentence):
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
+    algorithm = replace(ALGORITHMS["nsr_es"](config), **{function: lambda state, generation: returned})
+    with pytest.raises(EvaluationError, match=f"generation 1: `{function}` {sentence}") as error:
+        run_in_memory(config, algorithm=algorithm)
+    assert error.value.field == "search.algorithm"
+
+
+def test_without_a_map_no_cell_can_be_named():
+    config = config_of(generations=1, algorithm="es")
+    config = config.model_copy(update={"map": config.map.model_copy(update={"enabled": False})})
+    algorithm = replace(ALGORITHMS["es"](config), parents=lambda state, generation: [0])
+    with pytest.raises(EvaluationError, match=r"`parents` names the cells 0, .*; the run has no map"):
+        run_in_memory(config, algorithm=algorithm)
+
+
+def _without_last(state, *_):
+    return replace(state, centres=state.centres[:-1])
+
+
+def _with_three_parameters(state, index, *_):
+    wrong = replace(state.centres[index], centre_D=np.zeros(3, np.float32))
+    return replace(state, centres=(*state.centres[:index], wrong, *state.centres[index + 1 :]))
+
+
+@pytest.mark.parametrize(
+    ("restart", "sentence"),
+    [
+        (lambda *_: None, "returned NoneType; it must return a SearchState"),
+        (_without_last, "returned a state without centre 1, which it was called for; it has 1 centres"),
+        (_with_three_parameters, r"returned a state in which the parameters of centre 1 are float32 \(3,\); must be"),
+    ],
+)
+def test_a_restart_that_leaves_no_centre_is_an_error_with_a_sentence(restart, sentence):
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
+    begun = {"start_cells": lambda state, generation: {1: state.map.cell_N[0]}, "restart": restart}
+    algorithm = replace(ALGORITHMS["nsr_es"](config), **begun)
+    with pytest.raises(EvaluationError, match=f"generation 1: `restart` {sentence}"):
+        run_in_memory(config, algorithm=algorithm)
+
+
+@pytest.mark.parametrize(
+    ("step", "sentence"),
+    [
+        (_without_last, "returned a state without centre 1"),
+        (
+            lambda state, asked, gradient: _with_three_parameters(state, asked.centre),
+            r"returned a state in which the parameters of centre 1 are float32 \(3,\)",
+        ),
+    ],
+)
+def test_a_step_that_leaves_no_centre_is_an_error_with_a_sentence(step, sentence):
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
+    one = lambda state, generation: (Ask(1, state.centres[1].centre_D, 0.1, 16, 1.0),)  # noqa: E731
+    algorithm = replace(ALGORITHMS["nsr_es"](config), ask=one, step=step)
+    with pytest.raises(EvaluationError, match=f"generation 1: `step` {sentence}"):
+        run_in_memory(config, algorithm=algorithm)
+
+
+def test_numbers_of_numpy_name_cells_and_centres_as_those_of_python_do():
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
+    ours, seen = ALGORITHMS["nsr_es"](config), []
+
+    def restart(state, index, cell, elite):
+        seen.append((index, cell))
+        return ours.restart(state, index, cell, elite)
+
+    begun = lambda state, generation: {np.int64(1): state.map.cell_N[0]}  # noqa: E731
+    named = lambda state, generation: state.map.cell_N  # noqa: E731
+    run_in_memory(config, algorithm=replace(ours, start_cells=begun, parents=named, restart=restart))
+    assert [type(number) for number in seen[0]] == [int, int]
