@@ -9,6 +9,7 @@ step.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -113,7 +114,8 @@ def run(
             try:
                 finished.append(_generation(search, evaluator, store, elites, clock, state, record))
             except BaseException:
-                record()  # if the next generation has failed before it was sent
+                with suppress(_Stopped):  # or a stop would hide why this generation failed
+                    record()  # if it has failed before it was sent
                 raise
             state = finished[0].state
         record()

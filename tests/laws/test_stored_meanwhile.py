@@ -92,6 +92,20 @@ def test_an_error_of_the_next_generation_loses_nothing(evaluator):
     assert store.generation == 2
 
 
+@pytest.mark.parametrize("evaluator", [Beginning, lambda notes: Sharing()])
+def test_a_stop_does_not_hide_why_the_next_generation_failed(evaluator):
+    notes = []
+    store, compute = run(
+        evaluator(notes),
+        notes,
+        lambda row: Stop("enough") if row["generation"] == 2 else None,
+        ask=lambda asked, generation: asked if generation < 3 else (),
+    )
+    with pytest.raises(EvaluationError, match="generation 3"):
+        compute()
+    assert store.generation == 2
+
+
 def test_a_store_that_fails_is_not_asked_again():
     notes, failing = [], OSError("the disk is full")
 
