@@ -10,6 +10,7 @@ Axes: N policies, D policy parameters.
 from __future__ import annotations
 
 import hashlib
+import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -168,6 +169,8 @@ def recipes_again(origins: Sequence[Origin], parents: Mapping[bytes, FloatArray]
 _ORIGINS: dict[bytes, Origin] = {}
 """What `remember` has been told lately, by the name of the policy. A name is that of a content, so an entry is true
 wherever it comes from."""
+_CHANGING_ORIGINS = threading.Lock()
+"""Held by a thread that changes these: several runs of one process may each have one."""
 MOST_ORIGINS = 1 << 16
 """Most entries of these."""
 
@@ -178,12 +181,15 @@ def remember(recipes: Recipes, policy_N_D: Sequence[FloatArray]) -> None:
     Args:
         policy_N_D: what `recipes.made` has given.
     """
+    new = {}
     for (x, y), key_4, parameters_D in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, policy_N_D, strict=True):
         origin, name = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy()), name_of(parameters_D)
         if name not in (origin.x, origin.y):  # a policy as it is says nothing of how it was made
-            _ORIGINS[name] = origin
-    while len(_ORIGINS) > MOST_ORIGINS:
-        del _ORIGINS[next(iter(_ORIGINS))]
+            new[name] = origin
+    with _CHANGING_ORIGINS:
+        _ORIGINS.update(new)
+        while len(_ORIGINS) > MOST_ORIGINS:
+            del _ORIGINS[next(iter(_ORIGINS))]
 
 
 def origin_of(name: bytes) -> Origin | None:
@@ -231,7 +237,7 @@ class _Facts(NamedTuple):
 
 
 _KNOWN: dict[int, _Facts] = {}
-"""Facts by the `id` of a read-only array, as long as it lives: the same elites are parents again and again."""
+"""Facts by the `id` of an array that cannot change, while it lives; the same elites are parents again and again."""
 
 
 def _facts(parameters_D: FloatArray) -> _Facts:
@@ -245,6 +251,16 @@ def _facts(parameters_D: FloatArray) -> _Facts:
     largest = float(np.abs(values).max(initial=0.0))
     form = f"{parameters_D.dtype} {parameters_D.shape}"
     facts = _Facts(weakref.ref(parameters_D, lambda _: _KNOWN.pop(number, None)), name, form, largest)
-    if not parameters_D.flags.writeable:
+    if _cannot_change(parameters_D):
         _KNOWN[number] = facts
     return facts
+
+
+def _cannot_change(array: FloatArray) -> bool:
+    """Whether an array is read-only, and so is the memory of which it is a view."""
+    memory: object = array
+    while isinstance(memory, np.ndarray):
+        if memory.flags.writeable:
+            return False
+        memory = memory.base
+    return memory is None or isinstance(memory, bytes)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import random
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -96,6 +99,26 @@ def test_a_name_is_that_of_the_content():
     one.flags.writeable = False
     assert name_of(one) == name_of(one.copy()) != before
     assert len({name_of(parent) for parent in PARENTS}) == len(PARENTS)
+
+
+@pytest.mark.parametrize("view", [lambda array: array[:], lambda array: array[2:].view(), np.broadcast_to])
+def test_the_name_of_a_read_only_view_follows_the_array_that_is_seen_through_it(view):
+    array = PARENTS[0].copy()
+    seen = view(array, array.shape) if view is np.broadcast_to else view(array)
+    seen.flags.writeable = False
+    before = name_of(seen)
+    array[3] += 1.0
+    assert name_of(seen) == name_of(seen.copy()) != before
+
+
+def test_an_array_that_cannot_change_is_hashed_once(monkeypatch):
+    arrays = [PARENTS[0].copy(), np.stack(PARENTS), np.frombuffer(PARENTS[0].tobytes(), np.float32)]
+    for array in arrays[:2]:
+        array.flags.writeable = False
+    kept = [arrays[0], arrays[1][1], arrays[2]]
+    names = [*map(name_of, kept)]
+    monkeypatch.setattr(hashlib, "sha256", None)
+    assert [*map(name_of, kept)] == names
 
 
 # What travels
@@ -245,6 +268,23 @@ def test_a_policy_has_the_origin_of_which_it_was_made():
     assert isinstance(origin, Origin)
     known = dict(zip(asked.names, asked.parents, strict=True))
     assert bits(recipes_again([origin], known).made()[0]) == bits(asked.made()[3])
+
+
+def test_threads_that_remember_at_once_keep_the_newest_origins(monkeypatch):
+    """As two runs of one process do: each forgets the oldest entries, which another may have forgotten just now."""
+    monkeypatch.setattr("es_service.protocol.recipes.MOST_ORIGINS", 20)
+    asked = [recipes(100, seed) for seed in range(8)]
+    made = [one.made() for one in asked]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            for _ in range(10):
+                assert [*threads.map(remember, asked, made)] == [None] * 8
+    finally:
+        sys.setswitchinterval(interval)
+    remember(asked[0], made[0])
+    assert [origin_of(name_of(policy_D)) is not None for policy_D in made[0]] == [False] * 80 + [True] * 20
 
 
 def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
