@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from threading import Lock
+from threading import RLock
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -104,7 +104,7 @@ class PolicyEvaluator:
         """Number of parameters of a policy, D."""
         self._engine = engine
         self._closed = ""
-        self._in_turn = Lock()
+        self._in_turn = RLock()  # an error during a call closes the evaluator in its turn
 
     def initial(self, number: int = 0) -> FloatArray:
         """Parameters [D] with which a run of this config would begin, those of centre `number`: see `policy.init`."""
@@ -167,10 +167,12 @@ class PolicyEvaluator:
         )
 
     def close(self, why: str = "this evaluator is closed") -> None:
-        """End the workers. Later calls raise an EvaluationError that begins with `why`."""
-        if not self._closed:
-            self._closed = why
-            self._engine.close()
+        """End the workers, after the call of another thread if there is one. Later calls, also those that wait, raise
+        an EvaluationError that begins with `why`."""
+        with self._in_turn:
+            if not self._closed:
+                self._closed = why
+                self._engine.close()
 
 
 class Evaluating(AbstractContextManager[PolicyEvaluator]):

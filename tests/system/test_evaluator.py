@@ -7,9 +7,10 @@ import os
 import pickle
 import signal
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -283,6 +284,28 @@ def test_a_closed_evaluator_and_one_that_was_interrupted_say_so(monkeypatch):
         assert children() == before
         with pytest.raises(ServiceError, match=r"closed by an error during a call \(KeyboardInterrupt"):
             evaluate(POLICIES[:1])
+
+
+def test_closing_waits_for_the_call_of_another_thread(monkeypatch):
+    send, begun, free = ChildProcesses.send, Event(), Event()
+
+    def slow(*arguments):
+        begun.set()
+        assert free.wait(60)
+        send(*arguments)
+
+    monkeypatch.setattr(ChildProcesses, "send", slow)
+    with ThreadPoolExecutor(3) as threads:
+        with es_service.evaluator(CONFIG) as evaluate:
+            running = threads.submit(evaluate, POLICIES[:1])
+            assert begun.wait(60)
+            closing = threads.submit(evaluate.close)
+            assert wait([closing, running], 0.2).done == set()
+            free.set()
+        assert running.result().valid.all()
+        assert closing.result() is None
+    with pytest.raises(EvaluationError, match="this evaluator is closed"):
+        evaluate(POLICIES[:1])
 
 
 def test_workers_outlive_the_thread_that_started_them():
