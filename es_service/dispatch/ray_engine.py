@@ -27,8 +27,10 @@ from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
+from es_service.errors import Interrupted
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
+from es_service.protocol.raised import raised
 from es_service.protocol.sources import OtherCodeError
 
 
@@ -238,7 +240,7 @@ class Actors:
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions
         try:
-            value = self._ray.get(ref)
+            value = _read(call.what, self._ray.get(ref))
         except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
             if isinstance(error, OtherCodeError):
                 return self._refused(call.worker, str(getattr(error, "cause", error)))
@@ -251,12 +253,17 @@ class Actors:
                 return None
             return Failure(call.worker, call.item_id, call.attempt, said.message, said.traceback)
         except errors.RayError as error:
-            where = self._places.get(call.worker)
-            return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
+            return self._lost(call.worker, f"{self._place(call.worker)}: {fault_reason(error)}")
+        except Interrupted:  # a signal handler can raise this anywhere
+            raise
+        except Exception as error:  # a damaged message can raise any exception when it is read
+            said = raised(error)
+            reason = f"{self._place(call.worker)}: its message cannot be read: {said.message}"
+            return self._lost(call.worker, reason, traceback=said.traceback)
         del self._calls[ref]
         if call.what == "run":
             item = call.worker, call.item_id, call.attempt
-            if (results := pickle.loads(value)) is None:  # it lacks parents of policies
+            if value is None:  # it lacks parents of policies
                 if item in self._lacking:
                     return Failure(*item, LACKS_AGAIN, "")
                 self._lacking.add(item)
@@ -264,7 +271,7 @@ class Actors:
                 self.send(*item, call.work)
                 return None
             self._lacking.discard(item)
-            return Answer(call.worker, call.item_id, call.attempt, results)
+            return Answer(call.worker, call.item_id, call.attempt, value)
         if call.what == "compile":
             return Compiled(call.worker, call.kind, value)
         if call.what == "build":
@@ -272,10 +279,14 @@ class Actors:
             self._up.add(call.worker)
             return WorkerUp(call.worker)
         is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
-        self._places[call.worker] = WorkerPlace(*value)
+        self._places[call.worker] = value
         self._planned.pop(call.worker, None)
         self._followed = None
         return None if is_known else Placed(call.worker)
+
+    def _place(self, worker: int) -> str:
+        """Where a worker is, in words."""
+        return str(self._places.get(worker) or "before it had a place")
 
     def _follow(self, watch: Watch) -> None:
         """Report changes of the cluster. Drained and lost workers come before a smaller number of workers, which would
@@ -324,3 +335,17 @@ class Actors:
         has_begun = self._calls.owed_first().get(worker) in ("compile", "run")
         self.kill(worker)
         return WorkerLost(worker, reason, charge_item=has_begun, refused=refused, traceback=traceback)
+
+
+def _read(what: str, value: Any) -> Any:
+    """What a worker has answered to a call, where None of `run` says that it lacks parents of policies. Raises any
+    exception for a message that no worker of ours sends."""
+    match what:
+        case "run":
+            results = pickle.loads(value)
+            return None if results is None else list(results)
+        case "place":
+            return WorkerPlace(*value)
+        case "compile":
+            return float(value)
+    return str(value)

@@ -373,6 +373,44 @@ def test_an_actor_compiles_once_for_each_kind_and_nothing_else_is_asked_of_it():
     assert [type(actors.receive(0.0)) for _ in range(3)] == [Compiled, Answer, type(None)]
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("run", b"no pickle"),
+        ("run", pickle.dumps(object())),
+        ("run", b"cno_such_module\nno_such_name\n."),
+        ("place", ("host", 1)),
+        ("compile", "soon"),
+    ],
+)
+def test_a_message_that_cannot_be_read_is_the_loss_of_its_worker(call, message):
+    ray, calls = PretendedRay(), ("place", "build", "compile", "run")
+    actors = transport(ray, Limits(1))
+    actors.start(0)
+    actors.send(0, "key", 1, with_subject(FIRST, [CHUNK]))
+    ray.actors[0].owed[calls.index(call)].value = message
+    told = [actors.receive(0.0) for _ in range(calls.index(call) + 2)]
+    lost = told[-2]
+    assert isinstance(lost, WorkerLost)
+    assert "its message cannot be read: " in lost.reason
+    assert lost.charge_item == (call in ("compile", "run"))
+    assert told[-1] is None
+    assert ray.actors[0].state == "dead"
+
+
+def test_a_message_that_is_damaged_once_costs_one_attempt():
+    ray, limits = PretendedRay(), Limits(1, restart_backoff_s=0.0)
+
+    def damage(actor: Actor) -> None:
+        actor.owed[-1].value = b"no pickle"
+        ray.on_run = lambda actor: None
+
+    ray.on_run = damage
+    with ray_engine(ray, limits) as engine:
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert engine.counts.lost_workers == 1
+
+
 @pytest.mark.parametrize("grows", [False, True])
 def test_a_node_that_refuses_is_told_of_once_and_gets_no_other_worker(grows):
     """The run goes on with the others, and the refusal is no fault."""
