@@ -25,7 +25,7 @@ from es_service.store.folder import LOCK, explained
 _PATIENCE_S = 0.5
 """Seconds for which a writer tries to take the lock, because `lock_holder` holds a shared lock for an instant."""
 _MOST, _MOST_WORDS = 4096, 500
-"""Bytes of the file that are read, and characters of the words about an end, which always fit into them."""
+"""Bytes of the file that are read, and characters of the words about an end, each of which takes at most six bytes."""
 _OF_HOLDER = ("host", "pid", "since", "waiting_since", "doing")
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _held: weakref.WeakSet[RunLock] = weakref.WeakSet()
@@ -59,7 +59,8 @@ class RunLock:
     def _write(self, content: Mapping[str, Any]) -> None:
         # The lock itself is enough; on a full disk its file does not name the writer.
         with contextlib.suppress(OSError):
-            text = json.dumps(content).encode()
+            # Half of a surrogate pair, which a file's name may have, is no UTF-8: it is escaped as JSON does it.
+            text = json.dumps(content, ensure_ascii=False).encode(errors="backslashreplace")
             # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
             os.pwrite(self._descriptor, text.ljust(os.fstat(self._descriptor).st_size), 0)
 

@@ -68,10 +68,11 @@ def test_how_the_last_session_ended_is_known_until_another_one_ends(tmp_path):
     assert last_end(tmp_path) == "interrupted by SIGTERM"
     acquire_lock(tmp_path).release()  # as of a certification, which is no session
     assert last_end(tmp_path) == "interrupted by SIGTERM"
-    lock = acquire_lock(tmp_path)
-    lock.note_end("\u2028" * 100_000)
-    lock.release()
-    assert set(last_end(tmp_path)) == {"\u2028"}
+    for character in ("\u2028", "\U0001f600", "\0", "\udc80"):  # the last one as of a file's name that is no UTF-8
+        lock = acquire_lock(tmp_path)
+        lock.note_end(character * 100_000)
+        lock.release()
+        assert last_end(tmp_path) == character * 500
     lock = acquire_lock(tmp_path)
     lock.abandon()  # as a kill does
     killed = f"its driver on {socket.gethostname()}, pid {os.getpid()}, was killed, or its host failed"
