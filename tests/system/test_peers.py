@@ -1,10 +1,11 @@
 """The benchmark that compares es-service with other programs, as far as it works without them."""
 
+import subprocess
 import sys
 
 import pytest
 
-from tests.benchmarks import peers
+from tests.benchmarks import explain, peers
 from tests.benchmarks.peers_environments import ENVIRONMENTS, python_of, their_versions
 
 
@@ -34,3 +35,21 @@ def test_medians_leave_out_the_choice_of_a_batch_and_a_ratio_above_one_means_tha
         ["env_steps_per_second", "20.0", "40.0", "2.00"],
         ["ms_per_generation", "20.0", "40.0", "0.50"],
     ]
+
+
+@pytest.mark.parametrize(("module", "package"), [("peers", "gymnasium"), ("paper", "matplotlib")])
+def test_a_package_that_is_not_installed_is_named_without_a_traceback(module, package):
+    """As by `python -m`, where the package is hidden."""
+    run = f"import runpy, sys; sys.modules[{package!r}] = None; runpy.run_module({f'tests.benchmarks.{module}'!r})"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, cwd=peers.ROOT)
+    assert done.returncode == 1
+    command = "pip install -c constraints.txt -e '.[dev]'"
+    assert done.stderr.splitlines() == [
+        f"this measurement needs the package {package}, which is not installed; to install it: {command}"
+    ]
+
+
+def test_other_errors_of_a_measurement_keep_their_traceback(capsys):
+    error = ImportError("cannot import name x")
+    explain(type(error), error, None)
+    assert capsys.readouterr().err == "ImportError: cannot import name x\n"
