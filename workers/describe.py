@@ -3,7 +3,7 @@ of the user.
 
     python -m workers.describe NAME [SETTINGS]
 
-SETTINGS is JSON, what `settings_of_description` of `workers.environments` returns.
+SETTINGS is JSON, what `describe_environment` of `workers.environments` takes.
 Prints one line of JSON: {"task": fields of a TaskSpec} or {"problem": text}.
 """
 
@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import option_values
 from workers.environments import TaskError, describe_environment
 from workers.host.repeats import tried_apart
 from workers.rollouts import BACKENDS
@@ -26,23 +27,26 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
     """Description of a task that is no shipped one, with the reasons of the rollouts that cannot run it.
 
     Args:
-        settings: what a config chooses for it, as far as the description depends on it.
+        settings: see `describe_environment`.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
     task = describe_environment(name, settings)
+    options = option_values(task.options, settings.get("options", {}))
     able = {name: backend for name, backend in BACKENDS.items() if task.kind in backend.task_kinds}
-    reasons = {name: why for name, backend in able.items() if (why := backend.examine(task))}
+    reasons = {name: why for name, backend in able.items() if (why := backend.examine(task, options))}
     return dataclasses.replace(task, unsupported=reasons)
 
 
 def main(name: str, settings: str = "{}") -> None:
     """Print the description of a task, or the problem with it, as JSON."""
     try:
-        task = described(name, json.loads(settings))
+        given = json.loads(settings)
+        task = described(name, given)
         if task.kind == "python":
-            task = dataclasses.replace(task, does_not_repeat=tried_apart(task))
+            options = option_values(task.options, given.get("options", {}))
+            task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options))
         answer = {"task": dataclasses.asdict(task)}
     except TaskError as error:
         answer = {"problem": str(error)}

@@ -19,7 +19,7 @@ from es_service.config.model import RunConfig
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
-from es_service.protocol.options import Option, OptionValue, choice
+from es_service.protocol.options import Option, OptionValue, choice, option_values
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.rollouts import Rollouts
@@ -40,14 +40,26 @@ class Tasks(Mapping[str, TaskSpec]):
         return self.chosen(name, {}, None)
 
     def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
-        """The task with options and a descriptor, on which most tasks do not depend. Raises as a lookup."""
+        """The task with options and a descriptor. Raises as a lookup.
+
+        What is found by a trial (shapes, the rollouts that can run it, whether it repeats itself) holds for the
+        options, so a task of which some are not the defaults is described twice.
+        """
         if name == CALLER:
             return caller_task(options)
         if ":" not in name:
             return environments.SHIPPED[name]
         settings = environments.settings_of_description(name, options, descriptor)
-        code = user_sources(*task_code(name, descriptor))
-        return _described(name, json.dumps(settings, sort_keys=True), tuple(code.items()))
+        code = tuple(user_sources(*task_code(name, descriptor)).items())
+
+        def described(settings: Mapping[str, Any]) -> TaskSpec:
+            return _described(name, json.dumps(settings, sort_keys=True), code)
+
+        task, values = described(settings), {}
+        if "options" not in settings:
+            values = option_values(task.options, options)
+        others = {option: value for option, value in values.items() if value != task.options[option].default}
+        return described({**settings, "options": others}) if others else task
 
     def __iter__(self) -> Iterator[str]:
         return iter(environments.SHIPPED)

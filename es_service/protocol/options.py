@@ -66,6 +66,12 @@ def _problem(name: object, option: object) -> str:
     return ""
 
 
+def option_values(options: Mapping[str, Option], given: Mapping[str, object]) -> dict[str, OptionValue]:
+    """Values of all options: what is given, as far as it is allowed, and else the defaults."""
+    allowed = {name: allowed_value(option, given.get(name)) for name, option in options.items()}
+    return {name: options[name].default if value is None else value for name, value in allowed.items()}
+
+
 def allowed_value(option: Option, value: object) -> OptionValue | None:
     """A given value as a value of an option, a whole number also where the option has other numbers; None if it is not
     allowed."""

@@ -57,7 +57,8 @@ def why_not_repeatable(run: Run, config: RunConfig) -> str:
         return recorded
     if task.kind not in ("python", "function"):
         return ""
-    settings = settings_of_description(config.task.environment, config.task.options, config.task.descriptor)
+    options = config.task.options
+    settings = settings_of_description(config.task.environment, options, config.task.descriptor) | {"options": options}
     answers = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
     if any("problem" in answer for answer in answers):
         return ""

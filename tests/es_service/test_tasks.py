@@ -9,7 +9,8 @@ import pytest
 
 from es_service.cli.bench_rollouts import bench_rollouts
 from es_service.config.loading import load_config
-from es_service.config.tasks import TASKS
+from es_service.config.resolution import config_warnings
+from es_service.config.tasks import TASKS, task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
@@ -19,6 +20,7 @@ from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment
+from workers.host.repeats import does_not_repeat
 from workers.rollouts import BACKENDS
 
 HERE = __name__
@@ -100,6 +102,72 @@ def test_an_attribute_that_the_constructor_changes_is_refused_and_not_ignored():
     assert make_environment(f"{HERE}:Longer", {"steps": 5}) is not None
     with pytest.raises(TaskError, match=r"its constructor changes episode_steps \(5 -> 20\)"):
         make_environment(f"{HERE}:Longer", {"steps": 20})
+
+
+def _loaded(task: dict, **compute):
+    settings = {"task": task, "search": {"algorithm": "es"}, "budget": {"generations": 1}, "compute": compute}
+    return load_config(settings, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
+
+
+@pytest.mark.slow
+def test_the_options_of_a_run_decide_which_rollouts_can_compute_its_task():
+    name = "tests.es_service.xla_tasks:SometimesSorted"
+    chosen = {"environment": name, "options": {"sorts": True}}
+    config = _loaded(chosen)
+    assert config.compute.rollout == "xla"
+    (warning,) = config_warnings(config, task_of(config), BACKENDS)
+    assert warning.startswith(f"compute.rollout: xla is used because simd cannot run {name}: the primitive sort (at ")
+    with pytest.raises(ConfigError, match=r"simd cannot run .*: the primitive sort .*; must be auto or xla"):
+        _loaded(chosen, rollout="simd")
+    for options in ({}, {"sorts": False}):
+        assert _loaded({"environment": name, "options": options}).compute.rollout == "simd"
+    with pytest.raises(ConfigError, match=r"task.options.sorts: 5 is not allowed"):
+        _loaded({"environment": name, "options": {"sorts": 5}})
+
+
+def test_what_a_trial_finds_of_a_task_holds_for_the_options_of_the_run():
+    """Shapes, and whether it repeats itself."""
+    with pytest.raises(TaskError, match=r"observe has the shape \(3,\), not \(2,\)"):
+        describe_environment(f"{HERE}:Widened", {"options": {"size": 3}})
+    assert describe_environment(f"{HERE}:Widened", {"options": {"size": "no number"}}).observation_size == 2
+    task = describe_environment(f"python:{HERE}:Counting")
+    assert (does_not_repeat(task, {"counts": False}), does_not_repeat(task, {"counts": True})) == (
+        "",
+        "after another episode",
+    )
+
+
+class Widened(Still):
+    """an option changes the number of observations"""
+
+    options = {"size": Option(2, low=1)}  # noqa: RUF012
+
+    def __init__(self, size=2):
+        self.size = size
+
+    def reset(self, key):
+        return jnp.zeros(self.size)
+
+    def descriptor(self, state):
+        return state[:2]
+
+
+class Counting:
+    """an option lets it count its episodes"""
+
+    observation_size = action_size = 1
+    episode_steps = 3
+    options = {"counts": (False, True)}  # noqa: RUF012
+
+    def __init__(self, counts=False):
+        self.counts, self.episodes = counts, 0
+
+    def reset(self, seed):
+        self.episodes += self.counts
+        return np.full(1, self.episodes)
+
+    def step(self, action):
+        return np.zeros(1), 0.0, False
 
 
 @pytest.mark.slow

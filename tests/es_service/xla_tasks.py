@@ -59,6 +59,19 @@ class SortedStart:
         return state[:2]
 
 
+class SometimesSorted(SortedStart):
+    """the step sorts if an option says so"""
+
+    options = {"sorts": (False, True)}  # noqa: RUF012
+
+    def __init__(self, sorts: bool = False) -> None:
+        self.sorts = sorts
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = state + 0.1 * action
+        return jnp.sort(state) if self.sorts else state, state[0], state[0] > 1.1
+
+
 class Raising(SortedStart):
     """the step sorts, and raises when it is traced for a batch"""
 

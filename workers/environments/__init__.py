@@ -189,7 +189,7 @@ def make_host_task(
 def settings_of_description(
     name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None
 ) -> dict[str, Any]:
-    """The choices of a config on which the description of a task depends, as plain data; none for most tasks."""
+    """The choices of a config without which a task cannot be described, as plain data; none for most tasks."""
     settings: dict[str, Any] = {}
     if name.startswith(f"{LIBRARY}:"):
         settings["options"] = dict(options)
@@ -203,26 +203,27 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
     JAX.
 
     Args:
-        settings: `settings_of_description`.
+        settings: `settings_of_description`, and `options` with which it is tried if they are not the defaults.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
     kind, _, rest = name.partition(":")
+    options = settings.get("options", {})
     if kind == "brax":
         from workers.environments import brax_task
 
-        return brax_task.describe(rest)
+        return brax_task.describe(rest, options)
     if is_host_task(name):
         chosen = settings.get("descriptor")
         descriptor = tuple(chosen) if isinstance(chosen, list) else chosen
         if kind == LIBRARY:
             from workers.environments import gymnasium_task
 
-            return gymnasium_task.describe(rest, settings.get("options", {}), descriptor)
+            return gymnasium_task.describe(rest, options, descriptor)
         from workers.environments import python_task
 
-        return python_task.describe(rest, descriptor)
+        return python_task.describe(rest, descriptor, options)
     if is_function_task(name):
         from workers.environments import function_task
 
@@ -232,4 +233,4 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         raise TaskError(f"{name} has one colon; must be {kind}:module:{what}, such as {kind}:my_module:{rest or what}")
     from workers.environments import user_task
 
-    return user_task.describe(name)
+    return user_task.describe(name, options)

@@ -6,7 +6,9 @@ to [-1, 1], the range that Brax's environments expect.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from difflib import get_close_matches
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import Bounds, TaskSpec
-from es_service.protocol.options import choice
+from es_service.protocol.options import OptionValue, choice, option_values
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import Transform, brax_contact, quietly
 from workers.viewer import Viewer
@@ -44,14 +46,18 @@ class _State(NamedTuple):
     """Number of control steps."""
 
 
-def describe(name: str) -> TaskSpec:
+def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
     """Description of Brax's environment `name` as a task.
+
+    Args:
+        given: values of options that are not the defaults; sizes and descriptors are those of the backend.
 
     Raises:
         TaskError: Brax has no such environment, or its observations are not flat.
     """
     backends = _backends(name)
-    environment = _make_brax(name, backends[0])
+    backend = choice(*backends)
+    environment = _make_brax(name, str(option_values({"backend": backend}, given)["backend"]))
     with quietly():  # Brax's own `observation_size` would run a whole reset
         observation = jax.eval_shape(environment.reset, jax.random.key(0)).obs
     if len(getattr(observation, "shape", ())) != 1:
@@ -67,7 +73,7 @@ def describe(name: str) -> TaskSpec:
         descriptor_bounds=bounds,
         final_fitness=False,
         has_goal=False,
-        options={"descriptor": choice(*descriptors), "backend": choice(*backends)},
+        options={"descriptor": choice(*descriptors), "backend": backend},
         descriptors=descriptors,
         summary=f"{type(environment).__name__} of Brax",
     )

@@ -30,10 +30,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
-from es_service.protocol.options import OptionValue, declared_options
+from es_service.protocol.options import OptionValue, declared_options, option_values
 from workers.environments import TaskError
 from workers.environments.declared import are_finite, import_named, task_of_class, wrong_pairs, wrong_values
 from workers.environments.host_descriptors import describe_descriptor
@@ -59,11 +60,14 @@ KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", "walls", "wall
 PREFIX = "python:"
 
 
-def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
+def describe(
+    path: str, descriptor: DescriptorChoice | None = None, given: Mapping[str, OptionValue] = MappingProxyType({})
+) -> TaskSpec:
     """Description of a user's class as a task.
 
     Args:
         descriptor: the descriptor that the config chooses; None for that of the class.
+        given: values of options that are not the defaults, with which its methods are tried.
 
     Raises:
         TaskError: the class cannot be imported, its attributes or methods are missing or wrong, or they do not fit.
@@ -92,7 +96,7 @@ def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
     if wrong:
         raise TaskError(f"{name}: {'; '.join(wrong)}")
     spec = task_of_class(name, task, "python", (names, bounds), options)
-    made = make(path, {option_name: option.default for option_name, option in options.items()})
+    made = make(path, option_values(options, given))
     told = try_out(made, task.action_size)
     if not spec.success and IS_SUCCESS in told:
         spec = replace(spec, success=SUCCESS_OF_INFO)

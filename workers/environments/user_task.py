@@ -41,13 +41,14 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.options import OptionValue, declared_options
+from es_service.protocol.options import OptionValue, declared_options, option_values
 from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError
 from workers.environments.declared import import_named, task_of_class, wrong_values
@@ -67,8 +68,11 @@ JAX_KEY_WANTED = (
 )
 
 
-def describe(path: str) -> TaskSpec:
+def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
     """Description of a user's class as a task.
+
+    Args:
+        given: values of options that are not the defaults, with which its methods are tried.
 
     Raises:
         TaskError: the class cannot be imported, or its attributes or methods are missing or wrong.
@@ -91,7 +95,7 @@ def describe(path: str) -> TaskSpec:
         wrong += wrong_values(task, task.descriptor_names, task.descriptor_bounds, sizes)
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
-    _check_shapes(path, {name: option.default for name, option in options.items()})
+    _check_shapes(path, option_values(options, given))
     return task_of_class(path, task, "jax", (task.descriptor_names, task.descriptor_bounds), options)
 
 

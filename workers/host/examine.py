@@ -12,7 +12,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
+from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.raised import raised
 from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
@@ -48,12 +49,11 @@ class Examined:
     """Most memory of the process, in MiB."""
 
 
-def examine(task: TaskSpec, seconds: float) -> Examined:
-    """Examine a task that is described as `task`; at least one step is measured.
+def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) -> Examined:
+    """Examine a task that is described as `task`, with these options; at least one step is measured.
 
     Raises whatever the code of the task raises.
     """
-    options = {name: option.default for name, option in task.options.items()}
     if task.parameters is not None:
         function = make_function_task(task.name, options)
         start_D = task.parameters.first(0, 0)
@@ -116,8 +116,10 @@ def _hash(said: list[Any]) -> str:
 def main(name: str, settings: str, seconds: str) -> None:
     """Print the findings about a task, or its problem, as JSON."""
     try:
-        task = described(name, json.loads(settings))
-        answer: dict[str, Any] = asdict(examine(task, float(seconds)))
+        given = json.loads(settings)
+        task = described(name, given)
+        options = option_values(task.options, given.get("options", {}))
+        answer: dict[str, Any] = asdict(examine(task, options, float(seconds)))
     except TaskError as error:
         answer = {"problem": str(error)}
     except Exception as error:  # the user's code can raise anything

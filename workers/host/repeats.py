@@ -6,12 +6,14 @@ import os
 import select
 import signal
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
+from es_service.protocol.options import OptionValue
 from workers.environments import make_host_task
 from workers.environments.host_task import HostEnvironment
 
@@ -24,7 +26,7 @@ APART_S = 20.0
 SEED, OTHER_SEED = 1, 2
 
 
-def tried_apart(task: TaskSpec) -> str:
+def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
     """`does_not_repeat` in a copy of this process, which a simulator may end or make wait; empty if nothing was found.
 
     For a process with one thread. Whatever the simulator prints goes to stderr.
@@ -35,7 +37,7 @@ def tried_apart(task: TaskSpec) -> str:
         try:
             os.setsid()  # so that processes that the simulator starts end with it
             os.dup2(2, 1)
-            os.write(write, does_not_repeat(task).encode())
+            os.write(write, does_not_repeat(task, options).encode())
         finally:
             os._exit(0)
     os.close(write)
@@ -50,13 +52,13 @@ def tried_apart(task: TaskSpec) -> str:
         os.waitpid(child, 0)
 
 
-def does_not_repeat(task: TaskSpec) -> str:
+def does_not_repeat(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
     """Where the episode of a seed has other numbers than in a new object, in words; empty if nowhere.
 
     Tried are the same episode in an object that has had another one before, and in another new object. What is equal
     here may still differ in a longer episode, or in another process, which `es-service doctor TASK` tries.
     """
-    made = make_host_task(task.name, {name: option.default for name, option in task.options.items()})
+    made = make_host_task(task.name, options)
     coordinates, key = np.arange(STEPS * task.action_size, dtype=np.uint32), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
     action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
     actions_T = made.actions(action_T_A.reshape(STEPS, task.action_size))

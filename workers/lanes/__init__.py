@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.options import OptionValue, allowed_text, allowed_value
+from es_service.protocol.options import OptionValue, allowed_text, allowed_value, option_values
 from workers.environments import SHIPPED, TaskError, describe_environment, is_function_task, is_host_task
 from workers.lanes.blocks import BLOCK, Blocks
 from workers.lanes.compiled import CompiledLanes, compiled_resets, kernels
@@ -56,7 +56,7 @@ def options_of(task: TaskSpec, given: Mapping[str, OptionValue]) -> dict[str, Op
     """Value of every option of a task. Raises TaskError if the task has no such option, or a value is not allowed."""
     if not isinstance(given, Mapping):
         raise TaskError(f"task_options = {given!r} is no mapping from names of options to their values")
-    options = {name: option.default for name, option in task.options.items()}
+    options = option_values(task.options, {})
     for name, value in given.items():
         if (option := task.options.get(name)) is None:
             known = ", ".join(task.options) or "none"

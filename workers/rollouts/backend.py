@@ -109,8 +109,8 @@ class ChunkFunctions(NamedTuple):
 class RolloutBackend(Rollout, Protocol):
     """A rollout, as the processes see it that compute with it. They import JAX only if these functions do."""
 
-    def examine(self, task: TaskSpec) -> str:
-        """Reason why it cannot compute episodes of a task that is no shipped one; empty if it can.
+    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
+        """Reason why it cannot compute episodes of a task that is no shipped one with these options; empty if it can.
 
         Called where the task is described, in a process of its own; the answer is kept in `TaskSpec.unsupported`, so
         that the driver need not find it.

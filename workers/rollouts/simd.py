@@ -45,11 +45,11 @@ class Simd(RolloutBackend):
             return str(error)
         return ""
 
-    def examine(self, task: TaskSpec) -> str:
+    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
         """Why the task's steps cannot be compiled."""
         from workers.simd.episodes.rollout import why_not
 
-        return why_not(task)
+        return why_not(task, options)
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.simd.episodes.rollout`."""

@@ -12,7 +12,7 @@ import pytest
 
 import workers.simd.episodes.program
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
-from es_service.protocol.noise import Domain, normal_integers, stream_keys
+from es_service.protocol.noise import Domain, normal_integers, stream_keys, uniforms
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.backend import emit
@@ -46,6 +46,98 @@ def test_why_a_task_cannot_have_it():
     assert rollout.why_not(SHIPPED["point_maze"]) == ""
     sorting = describe_environment("tests.examples.sorting:Sorting")
     assert "the primitive sort (at " in rollout.why_not(sorting)
+
+
+MOVES = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+
+
+class Walk:
+    """a point walks by what a function makes of (state, action)"""
+
+    observation_size, action_size, episode_steps = 2, 4, 5
+    descriptor_names, descriptor_bounds = ("x", "y"), ((-1.0, 1.0),) * 2
+    move: Any = staticmethod(lambda state, action: state["x"])
+
+    def reset(self, key: Any) -> Any:
+        return {"x": jnp.zeros(2), "key": key, "count": jnp.uint32(0)}
+
+    def observe(self, state: Any) -> Any:
+        return state["x"]
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        return {**state, "x": self.move(state, action), "count": state["count"] + 1}, state["x"][0], False
+
+    def descriptor(self, state: Any) -> Any:
+        return state["x"]
+
+
+def _jax_random(state: Any, action: Any) -> Any:
+    return jax.random.normal(jax.random.fold_in(jax.random.wrap_key_data(state["key"][:2]), state["count"]), (2,))
+
+
+def _uniforms(state: Any, action: Any) -> Any:
+    return uniforms(state["key"], 2 * state["count"] + jnp.arange(2, dtype=jnp.uint32))
+
+
+def _until(state: Any, action: Any) -> Any:
+    return jax.lax.while_loop(lambda x: x.sum() < 3.0, lambda x: x + 1.0, state["x"])
+
+
+def _at_most(state: Any, action: Any) -> Any:
+    return jax.lax.fori_loop(0, 3, lambda _, x: jnp.where(x.sum() >= 3.0, x, x + 1.0), state["x"])
+
+
+def _chosen(array: Any, index: Any) -> Any:
+    return jax.nn.one_hot(index, len(array)) @ array
+
+
+def _replaced(array: Any, index: Any) -> Any:
+    return jnp.where(jnp.arange(len(array)) == index, 5.0, array)
+
+
+@pytest.mark.parametrize(
+    ("move", "advice", "instead"),
+    [
+        (_jax_random, "es_service.protocol.noise.uniforms(key, counters)", _uniforms),
+        (
+            lambda s, a: MOVES[jnp.argmax(a)],
+            "jax.nn.one_hot(index, len(array)) @ array",
+            lambda s, a: _chosen(MOVES, jnp.argmax(a)),
+        ),
+        (
+            lambda s, a: s["x"].at[jnp.argmax(a[:2])].set(5.0),
+            "jnp.where(jnp.arange(len(array)) == index, x, array)",
+            lambda s, a: _replaced(s["x"], jnp.argmax(a[:2])),
+        ),
+        (
+            lambda s, a: jnp.sort(s["x"] + a[:2]),
+            "jnp.minimum and jnp.maximum",
+            lambda s, a: jnp.stack([(s["x"] + a[:2]).min(), (s["x"] + a[:2]).max()]),
+        ),
+        (_until, "jnp.where(finished, old, new)", _at_most),
+    ],
+)
+def test_a_refusal_says_what_the_task_can_do_instead_and_then_it_is_compiled(
+    move: Any, advice: str, instead: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Walk, "move", staticmethod(move))
+    why = rollout.why_not(describe_environment(f"{__name__}:Walk"))
+    assert "test_refusals.py:" in why
+    assert advice in why.partition("; ")[2]
+    monkeypatch.setattr(Walk, "move", staticmethod(instead))
+    assert rollout.why_not(describe_environment(f"{__name__}:Walk")) == ""
+    if move is not _jax_random:  # which draws other numbers
+        state = Walk().reset(jnp.zeros(4, jnp.uint32)) | {"x": jnp.array([0.25, -0.5])}
+        action = jnp.array([0.1, 0.7, -0.3, 0.2])
+        np.testing.assert_allclose(instead(state, action), move(state, action))
+
+
+def test_a_key_of_jax_in_the_state_is_refused_with_what_to_use_instead(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(
+        Walk, "reset", lambda self, key: {"x": jnp.zeros(2), "key": jax.random.wrap_key_data(key[:2]), "count": 0}
+    )
+    why = rollout.why_not(describe_environment(f"{__name__}:Walk"))
+    assert why.startswith("values of type key<fry>: simd supports float32, int32, uint32 and bool; make random numbers")
 
 
 class Heat:

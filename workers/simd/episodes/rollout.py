@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
@@ -33,14 +35,16 @@ KEPT_PACKED = 4
 """Number of centres whose packed weights are kept, for work items that share centres."""
 
 
-def why_not(task: TaskSpec) -> str:
+def why_not(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType({})) -> str:
     """Reason why simd cannot run a task's episodes; empty if it can.
 
-    This compiles the steps of training episodes to LLVM IR, with the task's default options. Evaluation episodes
-    contain nothing else that may be unsupported. A reset is never a reason, because JAX computes those that simd cannot
-    compile.
+    This compiles the steps of training episodes to LLVM IR. Evaluation episodes contain nothing else that may be
+    unsupported. A reset is never a reason, because JAX computes those that simd cannot compile.
+
+    Args:
+        given: values of options; the others have their defaults.
     """
-    options = {name: option.default for name, option in task.options.items()}
+    options = option_values(task.options, given)
     spec = WorkerSpec(
         seed=0,
         environment=task.name,
@@ -196,7 +200,7 @@ class _Kernels:
                         check=check_episodes,
                         check_resets=partial(check_resets, environment=self._spec.environment),
                     )
-                except UnsupportedError as error:  # `why_not` checks the default options only
+                except UnsupportedError as error:  # shipped tasks are not examined
                     raise UnsupportedError(
                         f"simd cannot compile {self._spec.environment}: {error}; set compute.rollout to xla"
                     ) from error

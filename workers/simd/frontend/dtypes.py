@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.unsupported import UnsupportedError, way_round
 
 
 def graph_dtype(dtype: Any) -> str:
@@ -23,7 +23,8 @@ def graph_dtype(dtype: Any) -> str:
             return "i"
         case "bool":
             return "b"
-    raise UnsupportedError(f"values of type {dtype}: simd supports float32, int32, uint32 and bool")
+    advice = way_round("random_bits") if str(dtype).startswith("key<") else ""
+    raise UnsupportedError(f"values of type {dtype}: simd supports float32, int32, uint32 and bool", advice=advice)
 
 
 BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshape", "squeeze", "slice", "transpose",

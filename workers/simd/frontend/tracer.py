@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from workers.simd.frontend.dtypes import check_bytes, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
-from workers.simd.graph.unsupported import UnsupportedError, refusing
+from workers.simd.graph.unsupported import UnsupportedError, refusing, way_round
 
 Nodes = NDArray[np.int64]
 """Node numbers, in the shape of the array that they represent."""
@@ -50,7 +50,8 @@ class Tracer:
             rule = self.rules.get(equation.primitive.name)
             try:
                 if rule is None:
-                    raise UnsupportedError(f"the primitive {equation.primitive.name}")
+                    name = equation.primitive.name
+                    raise UnsupportedError(f"the primitive {name}", advice=way_round(name))
                 check_bytes(equation)
                 with refusing():
                     outputs = rule(self, equation, *map(read, equation.invars))
@@ -60,7 +61,7 @@ class Tracer:
                 # An equation inside of a library's function may have no source line; the calling equation has one.
                 where = source_info_util.summarize(equation.source_info)
                 if where and not error.place:
-                    raise UnsupportedError(str(error), where) from None
+                    raise UnsupportedError(error.message, place=where, advice=error.advice) from None
                 raise
             if not isinstance(outputs, list):
                 outputs = [outputs]

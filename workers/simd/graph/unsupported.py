@@ -5,14 +5,42 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+_UNIFORMS = (
+    "make random numbers by es_service.protocol.noise.uniforms(key, counters), with the key of reset and a counter in "
+    "the state"
+)
+_ONE_HOT = "instead of array[index] write jax.nn.one_hot(index, len(array)) @ array"
+_UPDATE = "instead of array.at[index].set(x) write jnp.where(jnp.arange(len(array)) == index, x, array)"
+_FORMULA = "write small systems out, or solve them by a fixed number of iterations"
+WAYS_ROUND = {
+    "gather": _ONE_HOT,
+    "dynamic_slice": _ONE_HOT,
+    "dynamic_update_slice": _UPDATE,
+    "scatter": _UPDATE,
+    "scatter-add": _UPDATE.replace(".set(x)", ".add(x)").replace("x, array", "array + x, array"),
+    "scatter-mul": _UPDATE.replace(".set(x)", ".multiply(x)").replace("x, array", "array * x, array"),
+    "sort": "order a few numbers by jnp.minimum and jnp.maximum of pairs of them",
+    "while": "use a fixed number of trips, in which what is finished no longer changes: jnp.where(finished, old, new)",
+    **dict.fromkeys(("cholesky", "lu", "qr", "eigh", "svd", "triangular_solve"), _FORMULA),
+}
+"""Primitive that is not supported, or not with data -> what a task can do instead."""
+
+
+def way_round(primitive: str) -> str:
+    """What a task can do instead of a primitive that is not supported; empty if nothing is known."""
+    if primitive.startswith(("random_", "threefry", "rng_")):
+        return _UNIFORMS
+    return WAYS_ROUND.get(primitive, "")
+
 
 class UnsupportedError(Exception):
-    """A function cannot be compiled; the message names the unsupported part and where it comes from."""
+    """A function cannot be compiled; the message names the unsupported part, where it comes from and a way round."""
 
-    def __init__(self, message: str, place: str = "") -> None:
-        """`place` is the line of the task that has the unsupported part, if that is known."""
-        super().__init__(f"{message} (at {place})" if place else message)
-        self.place = place
+    def __init__(self, message: str, *, place: str = "", advice: str = "") -> None:
+        """`place` is the line of the task that has the unsupported part, and `advice` what it can do instead, if that
+        is known."""
+        super().__init__(message + (f" (at {place})" if place else "") + (f"; {advice}" if advice else ""))
+        self.message, self.place, self.advice = message, place, advice
 
 
 @contextlib.contextmanager

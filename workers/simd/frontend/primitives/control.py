@@ -10,7 +10,7 @@ from workers.simd.frontend.dtypes import dtype_in
 from workers.simd.frontend.primitives.choices import select
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.unsupported import UnsupportedError, way_round
 
 MOST_TRIPS = 10_000
 """Most trips of a while loop, or of a scan with inputs or outputs per step; both become straight code."""
@@ -91,7 +91,7 @@ def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
         (go_on,) = t.closed(params["cond_jaxpr"], [*for_condition, *carry])
         value = t.values(go_on)
         if value is None:
-            raise UnsupportedError("a while loop whose end depends on the state")
+            raise UnsupportedError("a while loop whose end depends on the state", advice=way_round("while"))
         if not value:
             return carry
         carry = t.closed(params["body_jaxpr"], [*for_body, *carry])

@@ -10,7 +10,7 @@ from jax import lax
 from workers.simd.frontend.dtypes import graph_dtype
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.unsupported import UnsupportedError, way_round
 
 
 @primitive("broadcast_in_dim")
@@ -72,7 +72,8 @@ def _indices(t: Tracer, equation: Any, indices: Nodes, source: str) -> np.ndarra
     """Values of indices, which must be constants."""
     values = t.values(indices)
     if values is None:
-        raise UnsupportedError(f"{equation.primitive.name} with indices that depend on the state")
+        name = equation.primitive.name
+        raise UnsupportedError(f"{name} with indices that depend on the state", advice=way_round(name))
     return values.astype(np.int32).view(source).astype(np.int64)
 
 
