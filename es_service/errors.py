@@ -12,6 +12,7 @@ error can be pickled, for callers that run in the processes of a pool.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import indent
@@ -84,7 +85,8 @@ class Problem:
 
 
 class ServiceError(Exception):
-    """Base class of all errors that this package raises; the command line prints them without a traceback."""
+    """Base class of all errors that this package raises; the command line prints them without a traceback. A request to
+    stop is none: see `Interrupted`."""
 
     def __init__(
         self,
@@ -175,10 +177,16 @@ class RunLockedError(StoreError):
     """Another driver is writing to this run."""
 
 
-class Interrupted(ServiceError):  # noqa: N818 (a request to stop, not a fault)
-    """SIGINT or SIGTERM arrived; everything committed is safe. `signal_number` gives the exit code 128 + n."""
+class Interrupted(KeyboardInterrupt):
+    """SIGINT or SIGTERM arrived; everything committed is safe. `signal_number` gives the exit code 128 + n.
+
+    It is no ServiceError and no Exception, so that what goes on after an error, such as a study of Optuna or a loop
+    with `except Exception`, ends as it does with Ctrl-C at any other moment.
+    """
 
     def __init__(self, signal_number: int) -> None:
-        super().__init__(f"interrupted by signal {signal_number}")
-        self.args = (signal_number,)
+        super().__init__(signal_number)
         self.signal_number = signal_number
+
+    def __str__(self) -> str:
+        return f"interrupted by {signal.Signals(self.signal_number).name}"

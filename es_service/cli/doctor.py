@@ -24,7 +24,7 @@ from es_service.dispatch.cluster_findings import Finding
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import Interrupted, ServiceError
+from es_service.errors import ServiceError
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk
 from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
@@ -63,8 +63,6 @@ def print_findings(findings: Iterable[Finding], *, as_json: bool) -> bool:
 def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from check()
-    except Interrupted:
-        raise
     except (OSError, ServiceError) as error:
         yield "FAIL", f"{check.__name__.strip('_')}: {error}"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -54,6 +55,7 @@ from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
 from es_service.logs import logger
 from es_service.protocol.machine import VERSION
+from es_service.runs.signals import EARLY
 from es_service.store.folder import holds_run
 
 _LOG = logger(__name__)
@@ -191,7 +193,9 @@ def main() -> None:
         sys.stdout.reconfigure(errors="replace")  # print ? for a ± where only ASCII can be printed
     try:
         app()
-    except Interrupted:
+    except SystemExit as ended:
+        if ended.code == 128 + signal.SIGINT and (stop := _interruption(ended)) is not None:
+            raise stop from None
         raise
     except MemoryError as error:
         print_error(f"not enough memory{f': {error}' if str(error) else ''}. Reduce policy.hidden or search.pairs.")
@@ -202,6 +206,17 @@ def main() -> None:
         print_error(told)
         _LOG.debug("the traceback of this error", exc_info=error)
         sys.exit(2 if isinstance(told, ConfigError | NotInRunError) else 1)
+
+
+def _interruption(ended: SystemExit) -> Interrupted | None:
+    """What has interrupted a command. Typer ends it with the exit code of SIGINT after any KeyboardInterrupt, and Ray
+    raises one of its own in place of that of a signal handler."""
+    error: BaseException | None = ended
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return error if isinstance(error, Interrupted) else Interrupted(EARLY.number or signal.SIGINT)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ import typer
 
 from es_service.cli.commands import error_message
 from es_service.cli.options import print_error, print_note
-from es_service.errors import Interrupted, ServiceError
+from es_service.errors import ServiceError
 from es_service.runs.folders import runs_of
 from es_service.store.folder import holds_run
 
@@ -47,8 +47,6 @@ def items_of_each(
                 waits = run != folder and not holds_run(run)
                 for result in [None] if waits else read(run):
                     yield run, result
-            except Interrupted:
-                raise
             except ServiceError as error:
                 yield run, error
 

@@ -27,7 +27,6 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.dispatch.gpus import places
-from es_service.errors import Interrupted
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
@@ -255,8 +254,6 @@ class ChildProcesses:
                         return error
                     case _:
                         return RaisedError(f"it sent an unknown message: {said!r}", "")
-        except Interrupted:  # a signal handler can raise this anywhere
-            raise
         except Exception as error:  # a damaged message can raise any exception when it is unpickled
             return raised(error)
         return None if is_open else RaisedError("", "")

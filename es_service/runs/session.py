@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -196,7 +195,11 @@ def _noting_the_end(lock: RunLock) -> Iterator[None]:
     try:
         yield
     except Interrupted as stop:
-        lock.note_end(f"interrupted by {signal.Signals(stop.signal_number).name}")
+        lock.note_end(str(stop))
+        raise
+    except SystemExit as stop:
+        code = "" if stop.code is None else repr(stop.code)
+        lock.note_end(f"the program that ran it has ended it with sys.exit({code}), as tuners end their trials")
         raise
     except CallerLeft:
         lock.note_end("its caller has left the block of ask_tell")

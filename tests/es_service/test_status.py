@@ -223,6 +223,8 @@ def test_stopped_and_running(run, console, capsys):
         (ValueError("no\n luck"), "ValueError: no luck"),
         (Interrupted(signal.SIGTERM), "interrupted by SIGTERM"),
         (KeyboardInterrupt(), "KeyboardInterrupt"),
+        (SystemExit(0), "the program that ran it has ended it with sys.exit(0), as tuners end their trials"),
+        (SystemExit(), "the program that ran it has ended it with sys.exit(), as tuners end their trials"),
     ],
 )
 def test_why_a_run_has_stopped_is_told_until_it_is_finished(end, told, tmp_path):
@@ -232,7 +234,7 @@ def test_why_a_run_has_stopped_is_told_until_it_is_finished(end, told, tmp_path)
         return end
 
     folder = tmp_path / "run"
-    with contextlib.suppress(ValueError, Interrupted, KeyboardInterrupt):
+    with contextlib.suppress(ValueError, KeyboardInterrupt, SystemExit):
         api.run(SMALL | {"budget": {"generations": 2}}, folder, on_generation=ends)
     assert state(read_status(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
     assert state(read_status(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
