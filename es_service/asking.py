@@ -12,7 +12,7 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from queue import Queue
@@ -41,12 +41,26 @@ MOST_STEPS = 2**31 - 1
 LEFT = "the block of ask_tell was left; make the same call again to go on"
 
 
+@dataclass(frozen=True, order=True)
+class Token:
+    """Identity of what a run asks, which is the same in every session that asks it."""
+
+    run: str
+    """Id of the run."""
+    generation: int
+    request: int
+    """Number of the request in its generation, from 0. Most generations have two: members, and then the new centres."""
+
+    def __str__(self) -> str:
+        return f"request {self.request} of generation {self.generation}"
+
+
 @dataclass(frozen=True)
 class Asked:
-    """Episodes that the caller is to compute, one for each row."""
+    """Episodes that the caller is to compute, one for each row. It can be pickled."""
 
-    generation: int
-    """Generation that they belong to. Most have two asks: members of populations, and then the new centres."""
+    token: Token
+    """What their results are told by."""
     parameters: FloatArray
     """[N, D]: the policies, or the parameters of what has no policy; members of populations have their noise."""
     observation_mean: FloatArray
@@ -58,6 +72,11 @@ class Asked:
     """[N]: whether it is an episode of a member, whose observations update the statistics."""
     _rows: Rows
     _spec: WorkerSpec
+
+    @property
+    def generation(self) -> int:
+        """Generation that they belong to."""
+        return self.token.generation
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -119,6 +138,7 @@ class AskTell:
 
     def tell(
         self,
+        asked: Asked,
         fitness: ArrayLike,
         descriptor: ArrayLike | None = None,
         *,
@@ -127,9 +147,10 @@ class AskTell:
         moments: tuple[float, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Tell the results of what was asked, in the order of its rows; when it returns, a generation that is complete
-        has been committed.
+        has been committed. Results are told once: a second call for the same rows is refused.
 
         Args:
+            asked: what `ask` returned.
             fitness: [N], maximised: the return of each episode. NaN: the episode is invalid.
             descriptor: [N, B]; None: the first B parameters of each row.
             valid: [N] of bools, false for episodes that failed.
@@ -140,9 +161,10 @@ class AskTell:
         Raises:
             ConfigError: an argument is wrong; `field` names it. Otherwise as `ask`.
         """
-        asked = self.ask()
-        if asked is None:
+        now = self.ask()
+        if now is None:
             raise EvaluationError("the run has ended, so nothing is asked; resume it with a larger budget")
+        _require_same(asked, now.token)
         count, size = len(asked), asked.observation_mean.shape[1]
         fitness_N = _array("fitness", fitness, (count,)).astype(np.float32)
         is_valid_N = np.ones(count, bool) if valid is None else _array("valid", valid, (count,))
@@ -198,6 +220,7 @@ class _CallersEpisodes:
 
     def __init__(self, spec: WorkerSpec, between: AskTell) -> None:
         self._spec, self._between = spec, between
+        self._next = Token(between.run.meta.run_id, 0, 0)
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         """Ask the caller; gradients are computed here."""
@@ -207,7 +230,11 @@ class _CallersEpisodes:
             return gradients(self._spec, work)
         rows, between = rows_of(self._spec, work), self._between
         shown = rows.parameters_N_D, rows.mean_N_O, rows.std_N_O, rows.seed_N, rows.is_noisy_N
-        between._from_run.put(Asked(work[0][1].generation, *shown, rows, self._spec))
+        token, generation = self._next, work[0][1].generation
+        if generation != token.generation:
+            token = replace(token, generation=generation, request=0)
+        self._next = replace(token, request=token.request + 1)
+        between._from_run.put(Asked(token, *shown, rows, self._spec))
         if (told := between._to_run.get()) is None:
             raise CallerLeft
         return results_of(self._spec, work, told)
@@ -229,7 +256,7 @@ def ask_tell(
         with ask_tell("my_config.yaml", "runs/mine") as search:
             while (asked := search.ask()) is not None:
                 fitness, descriptor = simulate(asked.parameters)      # arrays [N] and [N, B]
-                search.tell(fitness, descriptor)
+                search.tell(asked, fitness, descriptor)
 
     The task of the config is `caller`. Its options are either `parameters`, the number of parameters, or
     `observation_size` and `action_size` of a policy, and `descriptor_size`. If the block is left before the end, the
@@ -277,6 +304,26 @@ def ask_tell(
         thread.join()
         if search.outcome is None and search._error is None:  # what the run asked last may still be in the queue
             search._error = EvaluationError(LEFT)
+
+
+def _require_same(asked: object, now: Token) -> None:
+    """Raise ConfigError unless `asked` is what the run asks now."""
+    if not isinstance(asked, Asked):
+        raise ConfigError(
+            f"asked is of the type {type(asked).__name__}; must be what `ask` returned, as in "
+            "search.tell(asked, fitness, descriptor)",
+            field="asked",
+            allowed="what `ask` returned",
+        )
+    if asked.token != now:
+        when = "have been told already" if asked.token < now else "are not wanted yet"
+        what = f"is {asked.token}, whose results {when}" if asked.token.run == now.run else "belongs to another run"
+        raise ConfigError(
+            f"asked {what}; this run waits for the results of {now}, which `ask` returns",
+            field="asked",
+            value=asked.token,
+            allowed="what `ask` returns now",
+        )
 
 
 def _array(name: str, given: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

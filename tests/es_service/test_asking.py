@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -50,7 +52,7 @@ def told_of(asked: Asked):
 def finished(config, folder):
     with ask_tell(config, folder) as search:
         while (asked := search.ask()) is not None:
-            search.tell(*told_of(asked))
+            search.tell(asked, *told_of(asked))
         assert search.outcome is not None
         assert search.ask() is None
         return search.run
@@ -87,7 +89,7 @@ def test_policies_act_as_in_the_service_s_own_episodes(policy, tmp_path):
                 taken = [maze.step(one) for maze, one in zip(mazes, made.actions(asked.act(seen, step)), strict=True)]
                 seen = np.array([place for place, *_ in taken])
                 returns += [reward for _, reward, _ in taken]
-            search.tell(returns, [maze.descriptor() for maze in mazes], steps=np.full(len(asked), steps))
+            search.tell(asked, returns, [maze.descriptor() for maze in mazes], steps=np.full(len(asked), steps))
         ours = search.run
     theirs = api.run(config_of(task={"environment": name, "episode_steps": steps}, **sections), tmp_path / "run").run
     for column in ("best_fitness", "centre_fitness_mean", "update_norm", "env_steps"):
@@ -104,7 +106,7 @@ def test_left_anywhere_it_asks_the_same_again_and_ends_with_the_same_bits(tmp_pa
                 key = asked.generation, len(asked), bool(asked.trains.any())
                 arrays = asked.parameters.tobytes(), asked.seed.tobytes()
                 assert seen.setdefault(key, arrays) == arrays
-                search.tell(*told_of(asked))
+                search.tell(asked, *told_of(asked))
     assert search.outcome is not None
     assert digest_parts(folder) == digest_parts(whole.folder)
 
@@ -127,7 +129,7 @@ def test_observations_that_are_told_normalise_later_ones(tmp_path):
             np.testing.assert_allclose(asked.observation_mean, [expected[0]] * count, rtol=1e-4)
             np.testing.assert_allclose(asked.observation_std, [expected[1]] * count, rtol=1e-4)
             moments = (1e8, [3.0, -1.0], [4e8, 0.25e8]) if asked.trains.any() else None
-            search.tell(np.arange(count), np.zeros((count, 1)), moments=moments)
+            search.tell(asked, np.arange(count), np.zeros((count, 1)), moments=moments)
 
 
 def test_of_several_populations_all_observations_are_told_once_or_not_at_all(tmp_path):
@@ -135,9 +137,8 @@ def test_of_several_populations_all_observations_are_told_once_or_not_at_all(tmp
         with ask_tell(config_of("memes", **OBSERVING), tmp_path / folder) as search:
             while (asked := search.ask()) is not None and asked.generation < 3:
                 given = moments if asked.trains.any() else None
-                search.tell(
-                    np.arange(len(asked)), np.zeros((len(asked), 1)), steps=np.full(len(asked), 7), moments=given
-                )
+                steps = np.full(len(asked), 7)
+                search.tell(asked, np.arange(len(asked)), np.zeros((len(asked), 1)), steps=steps, moments=given)
             return moments_from_arrays(search.run.parts(wanted=lambda part: part == OBSERVATIONS)[1][OBSERVATIONS])
 
     assert told("none", None).count == 0
@@ -153,8 +154,48 @@ def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
             fitness, place = told_of(asked)
             if asked.trains.any():
                 fitness[4] = np.nan
-            search.tell(fitness, place, valid=~asked.trains | (np.arange(len(asked)) != 3))
+            search.tell(asked, fitness, place, valid=~asked.trains | (np.arange(len(asked)) != 3))
         assert search.run.history["invalid_members"].tolist()[-1] == 2
+
+
+def test_results_are_told_once_and_only_of_what_is_asked_now(tmp_path):
+    """In each of its two requests, a generation of these policies has as many rows as in the other."""
+    config = config_of("es", search={"algorithm": "es", "pairs": 8, "sigma": 0.2, "evaluation_episodes": 16})
+    whole, told, pickled = finished(config, tmp_path / "whole"), [], b""
+
+    def refused(search, given, *rest):
+        with pytest.raises(ConfigError) as caught:
+            search.tell(given, *rest)
+        assert caught.value.field == "asked"
+        return caught.value.sentence
+
+    def told_by(search):
+        asked = search.ask()
+        search.tell(asked, *told_of(asked))
+        told.append(asked)
+
+    with ask_tell(config, tmp_path / "run") as search:
+        told_by(search)
+        said = refused(search, told[-1], *told_of(told[-1]))
+        assert "is request 0 of generation 0, whose results have been told already; " in said
+        assert said.endswith("; this run waits for the results of request 0 of generation 1, which `ask` returns")
+        told_by(search)
+        assert len(search.ask()) == len(told[-1])
+        for stale in told:
+            assert f"{stale.token}, whose results have been told already" in refused(search, stale, *told_of(stale))
+        for other in (np.zeros(16), None):
+            assert "must be what `ask` returned, as in search.tell(asked, " in refused(search, other, np.zeros((16, 2)))
+        with ask_tell(config, tmp_path / "twin") as twin:
+            assert "belongs to another run" in refused(search, twin.ask(), np.zeros(16))
+        pickled = pickle.dumps(search.ask())
+    with ask_tell(config, tmp_path / "run") as search:  # which asks generation 1 again from its beginning
+        ahead = pickle.loads(pickled)
+        assert "request 1 of generation 1, whose results are not wanted yet" in refused(search, ahead, *told_of(ahead))
+        told_by(search)
+        search.tell(ahead, *told_of(ahead))
+        while search.ask() is not None:
+            told_by(search)
+    assert digest_parts(tmp_path / "run") == digest_parts(whole.folder)
 
 
 @pytest.mark.parametrize(
@@ -181,12 +222,12 @@ def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
 def test_a_wrong_argument_is_named_and_the_next_call_works(arguments, field, tmp_path):
     with ask_tell(config_of("es"), tmp_path / "run") as search:
         with pytest.raises(ConfigError) as caught:
-            search.tell(**arguments)
+            search.tell(search.ask(), **arguments)
         assert caught.value.field == field
         asked = search.ask()
         assert asked is not None
         assert len(asked) == 2
-        search.tell(*told_of(asked))
+        search.tell(asked, *told_of(asked))
         assert search.run.generation == 0
 
 
@@ -195,9 +236,9 @@ def test_what_is_no_task_of_the_caller_is_refused_and_so_is_telling_after_the_en
         ask_tell(config_of(task={"environment": "point_maze"}), tmp_path / "run").__enter__()
     with ask_tell(config_of("es", budget={"generations": 1}), tmp_path / "run") as search:
         while (asked := search.ask()) is not None:
-            search.tell(*told_of(asked))
+            search.tell(asked, *told_of(asked))
         with pytest.raises(EvaluationError, match="the run has ended, so nothing is asked"):
-            search.tell([0.0])
+            search.tell(asked, [0.0])
     for asks in (0, 1):
         with ask_tell(config_of("es"), tmp_path / "left") as search:
             for _ in range(asks):
@@ -213,10 +254,10 @@ def test_what_stops_a_run_and_how_it_goes_on_is_told_in_the_caller_s_words(tmp_p
     with ask_tell(config_of("es"), folder) as search:
         asked = search.ask()
         with pytest.raises(EvaluationError) as caught:
-            search.tell(np.full(len(asked), np.nan))
+            search.tell(asked, np.full(len(asked), np.nan))
     assert f"continue with its first generation after the cause is fixed: {call}" in str(caught.value)
     with ask_tell(config_of("es"), folder) as search:
-        search.tell(*told_of(search.ask()))
+        search.tell(asked, *told_of(asked))
     said = CliRunner().invoke(app, ["status", str(folder)]).output
     assert "its caller has left the block of ask_tell" in " ".join(said.split())
     assert call in "".join(said.split("\n")).replace(" ", "").replace(",", ", ")

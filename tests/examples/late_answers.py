@@ -29,7 +29,7 @@ def search(folder):
             fitness, descriptor = np.empty(len(asked)), np.empty((len(asked), 2))
             for job in as_completed(row_of):  # in the order in which they are done
                 fitness[row_of[job]], descriptor[row_of[job]] = job.result()
-            asking.tell(fitness, descriptor)
+            asking.tell(asked, fitness, descriptor)
         return asking.run
 
 

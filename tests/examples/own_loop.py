@@ -41,7 +41,7 @@ def search(folder):
     """The run, in `folder`; a call that was interrupted goes on."""
     with ask_tell(CONFIG, folder) as asking:
         while (asked := asking.ask()) is not None:
-            asking.tell(*episodes(asked), steps=np.full(len(asked), STEPS))
+            asking.tell(asked, *episodes(asked), steps=np.full(len(asked), STEPS))
         return asking.run
 
 
