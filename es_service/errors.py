@@ -21,6 +21,11 @@ from typing import Any, Literal
 Action = Literal["run", "resume", "fork", "watch", "report", "certify", "ask_tell", "install"]
 
 
+def counted(how_many: int, singular: str, plural: str = "") -> str:
+    """A number and a noun, such as "1 worker", "3 workers" or, with a plural of its own, "2 policies"."""
+    return f"{how_many:,} {singular if how_many == 1 else plural or f'{singular}s'}"
+
+
 @dataclass(frozen=True)
 class WayOut:
     """A remedy for an error: a function of this package and its arguments."""

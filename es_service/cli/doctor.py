@@ -24,7 +24,7 @@ from es_service.dispatch.cluster_findings import Finding
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import ServiceError
+from es_service.errors import ServiceError, counted
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk
 from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
@@ -87,7 +87,7 @@ def _ray() -> Iterator[Finding]:
 
 def _machine() -> Iterator[Finding]:
     usable, present = cores(), os.cpu_count() or 1
-    yield "ok", f"{usable} of {present} cores are usable; by default, each runs one worker"
+    yield "ok", f"{usable} of {counted(present, 'core')} can be used; by default, each runs one worker"
     memory, is_free = memory_bytes()
     level = "ok" if memory >= MIN_MEMORY_BYTES else "note"
     yield level, f"{memory / 2**30:.1f} GiB of memory {'free' if is_free else 'in all'}"

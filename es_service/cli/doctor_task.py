@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from es_service.config.problems import did_you_mean, one_of
 from es_service.config.tasks import TASKS
 from es_service.dispatch.cluster_findings import Finding
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, counted
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
 from es_service.runs.repeating import compared, examined
 
@@ -60,5 +60,5 @@ def _what(task: TaskSpec) -> str:
     actions = "actions to choose from" if task.discrete_actions else "numbers in an action"
     return (
         f"{task.name}: {task.summary or 'a task'}; {task.observation_size} numbers in an observation, "
-        f"{task.action_size} {actions}, {task.episode_steps} steps"
+        f"{task.action_size} {actions}, {counted(task.episode_steps, 'step')}"
     )

@@ -101,8 +101,9 @@ def run(
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
     print_config_notes(config, [(wanted, loaded)])
-    with contextlib.suppress(SystemExit):  # rich's answer to a closed output
-        print_line(console, parallel_sentence(loaded))
+    if loaded.compute.engine == "ray":  # on the cores of one machine it says nothing that helps
+        with contextlib.suppress(SystemExit):  # rich's answer to a closed output
+            print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
     with _naming(config, wanted):
         session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)

@@ -49,7 +49,7 @@ from es_service.config.shipped import read_config
 from es_service.config.start import folder_problems
 from es_service.config.tasks import Tasks
 from es_service.config.yaml_text import show
-from es_service.errors import ConfigError, Problem
+from es_service.errors import ConfigError, Problem, counted
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.user_code import in_no_file
@@ -207,7 +207,7 @@ def _load(
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
     if problems or settings is None:
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        count = counted(len(problems), "problem")
         raise ConfigError.listing(f"{name}: {count}", problems)
     nested = _nested(values)
     return RunConfig.model_validate(nested | {"search": settings.model_validate(nested["search"])}).made_for(task)

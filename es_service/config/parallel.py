@@ -5,6 +5,7 @@ from __future__ import annotations
 from es_service.config.model import RunConfig
 from es_service.config.search import PopulationConfig
 from es_service.config.tasks import ROLLOUTS
+from es_service.errors import counted
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK
 from es_service.protocol.policies import chunks_of
 
@@ -43,14 +44,15 @@ def chunks_at_once(config: RunConfig) -> int:
 def parallel_sentence(config: RunConfig) -> str:
     """How much work there is at a time, and the keys that change it."""
     search, chunks, several, keys = config.search, chunks_at_once(config), config.search.populations(), _keys(config)
-    work = f"{search.policies()} policies"
+    work = counted(search.policies(), "policy", "policies")
     if isinstance(search, PopulationConfig):
-        size = f"{search.pairs} pairs"
+        size = counted(search.pairs, "pair")
         if keys[0] == "search.evaluation_episodes":
-            size = f"{search.evaluation_episodes} evaluation episodes"
+            size = counted(search.evaluation_episodes, "evaluation episode")
         work = f"{size} around {'one centre' if several == 1 else f'{several} centres'}"
     return (
-        f"a generation has {chunks} chunks of work at a time ({work}), enough for {chunks} workers; "
+        f"a generation has {counted(chunks, 'chunk')} of work at a time ({work}), enough for "
+        f"{counted(chunks, 'worker')}; "
         f"{' and '.join(keys)} change{'s' if len(keys) == 1 else ''} that"
     )
 

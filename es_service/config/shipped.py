@@ -21,6 +21,16 @@ def shipped_configs() -> dict[str, Path]:
     return {} if place is None else {file.stem: file for file in sorted(place.glob("*.yaml"))}
 
 
+def first_sentence(text: str) -> str:
+    """The first sentence of the comment that a config begins with: its lines until one ends with a full stop."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        if not line.startswith("#") or (lines and lines[-1].endswith(".")):
+            break
+        lines.append(line.lstrip("# "))
+    return " ".join(lines)
+
+
 def config_file(source: str | os.PathLike[str]) -> Path:
     """The file at a path or, if it does not exist, the file of the shipped config with this name."""
     path = Path(source)

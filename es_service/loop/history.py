@@ -163,6 +163,14 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     )
 
 
+def evaluated_word(row: Row) -> str:
+    """What the columns centre_* of a row are about: "centre", or "policy" where a generation has moved no centre and
+    evaluated policies as they are, of which it is the fittest."""
+    update_norm = row["update_norm"]
+    moved = update_norm is not None and math.isfinite(update_norm)
+    return "centre" if moved or row["generation"] == 0 else "policy"
+
+
 @dataclass(frozen=True)
 class Resets:
     """Address of the resets of an evaluation's episodes; see `protocol.noise.evaluation_reset_keys`."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from es_service.errors import counted
 from es_service.report import floor
 from es_service.report.colours import SCALE, level, value_range
 from es_service.report.data import RunData
@@ -65,7 +66,7 @@ def cloud(data: RunData) -> tuple[Markup, dict[str, Any], tuple[float, float], s
         "level": packed(level(fitness_N, *colours), "int8"),
         "colours": SCALE,
         "stops": [
-            [count, f"generation {end:,}: {count:,} centres, best {number(best)}"]
+            [count, f"generation {end:,}: {counted(count, 'centre')}, best {number(best)}"]
             for end, count, best in zip(ends.tolist(), counts, _best_until(fitness_N, counts), strict=True)
         ],
     }

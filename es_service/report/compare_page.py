@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from es_service.errors import NotInRunError
-from es_service.report import compare, facts, maps
+from es_service.errors import NotInRunError, counted
+from es_service.report import compare, maps
 from es_service.report.bootstrap import WHOLE_RANGE, coverage
 from es_service.report.colours import value_range
 from es_service.report.compare import Group, Quartiles, Summary
@@ -78,14 +78,14 @@ def comparison_sections(
         "maps": joined(_maps(groups)),
         "runs": section("Runs", _runs(groups), id_="runs"),
     }  # fmt: skip
-    return f"{len(runs)} runs on {task}", sections, {"charts": points}
+    return f"{counted(len(runs), 'run')} on {task}", sections, {"charts": points}
 
 
 def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
     summaries = compare.summaries(groups, threshold)
     best = max(summaries, key=lambda summary: summary.values["best_fitness"].median)
     value = number(best.values["best_fitness"].median)
-    runs = facts.count(len(best.group.runs), "run")
+    runs = counted(len(best.group.runs), "run")
     known = _interval(best, "best_fitness")
     interval = f", {known}" if known else ""
     if len(groups) == 1:
@@ -98,7 +98,7 @@ def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
     if threshold is not None:
         solved = sum(summary.solved for summary in summaries)
         total = sum(len(summary.group.runs) for summary in summaries)
-        sentence += f"; {solved} of {total} runs reach {number(threshold)}"
+        sentence += f"; {solved} of {counted(total, 'run')} reach {number(threshold)}"
     return f"{sentence}."
 
 
@@ -150,13 +150,13 @@ def _about_intervals(groups: Sequence[Group]) -> str:
 
 
 def _seeds(groups: Sequence[Group]) -> str:
-    return "; ".join(f"{group.name} has {facts.count(group.seeds, 'seed')}" for group in groups)
+    return "; ".join(f"{group.name} has {counted(group.seeds, 'seed')}" for group in groups)
 
 
 def _seeds_of(group: Group) -> str:
     """The number of seeds of a group, and that of its runs if some have the same."""
     runs = len(group.runs)
-    return f"{group.seeds}" if group.seeds == runs else f"{group.seeds} in {runs} runs"
+    return f"{group.seeds}" if group.seeds == runs else f"{group.seeds} in {counted(runs, 'run')}"
 
 
 def _interval(summary: Summary, column: str) -> str:
@@ -172,7 +172,13 @@ def _shown(values: Quartiles, column: str, interval: str = "") -> Markup:
     scale, unit = UNITS.get(column, (1.0, ""))
     median, low, high = (number(scale * value) for value in values)
     ranges = [interval, "" if low == high else f"quartiles {low} to {high}"]
-    return tag("div", f"{median}{unit}", *(tag("div", text, class_="note") for text in ranges if text))
+    return tag("div", f"{median}{unit}", *(_note(text) for text in ranges if text))
+
+
+def _note(text: str) -> Markup:
+    """A range below a number; in a narrow table its name is on a line of its own."""
+    name, ends = text.split(" ", 1)
+    return tag("div", f"{name} ", tag("span", ends), class_="note")
 
 
 def _maps(groups: Sequence[Group]) -> list[Markup]:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from es_service.errors import counted
+from es_service.loop.history import evaluated_word
 from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
@@ -35,8 +37,9 @@ def verdict(data: RunData) -> str:
     # A run of generation 0 alone has evaluated random weights and has not searched.
     alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
     episodes = data.constants["search.evaluation_episodes"]
-    clause = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
-    sentence = f"{alone}{clause} over {count(episodes, 'evaluation episode')} (selected, not certified)"
+    word = evaluated_word({name: data.last(name) for name in ("generation", "update_norm")})
+    clause = f"The best {word}, found {where}, has a mean fitness of {number(fitness)}"
+    sentence = f"{alone}{clause} over {counted(episodes, 'evaluation episode')} (selected, not certified)"
     target = data.status.limits.get("target_fitness")
     if target is not None:
         reached = "reaches" if fitness >= target else "does not reach"
@@ -58,8 +61,8 @@ def _certified(data: RunData) -> str:
     value = f"{number(row['return_mean'])} ({number(row['return_low'])} to {number(row['return_high'])})"
     success = "" if row["successes"] is None else f" and succeeds in {row['successes']:,} of them"
     return (
-        f"The certified policy, {row['policy']}, has the return {value} in {row['episodes']:,} episodes that no "
-        f"choice has seen{success}. "
+        f"The certified policy, {row['policy']}, has the return {value} in "
+        f"{counted(row['episodes'], 'episode')} that no choice has seen{success}. "
     )
 
 
@@ -67,7 +70,7 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
     """Task, search, state and budget, as (label, text)."""
     constants, limits = data.constants, data.status.limits
     fields = [
-        ("task", f"{constants['task.environment']}, {constants['task.episode_steps']:,} steps an episode"),
+        ("task", f"{constants['task.environment']}, {counted(constants['task.episode_steps'], 'step')} an episode"),
         ("search", f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}"),
         ("state", state(data.status)),
     ]
@@ -80,7 +83,7 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
                 f"{data.last('env_steps'):,.0f}{of.get('env_steps', '')} in {data.last('episodes'):,.0f} episodes",
             ),
             *_objectives(data),
-            ("time", f"{duration(data.last('wall_clock_s'))} on {count(int(data.last('workers')), 'worker')}"),
+            ("time", f"{duration(data.last('wall_clock_s'))} on {counted(int(data.last('workers')), 'worker')}"),
         ]
     if data.meta.parent:
         parent = data.meta.parent
@@ -141,8 +144,8 @@ def fault_sentence(faults: list[Fault]) -> str:
     lost, retries = sum(fault.lost_workers for fault in faults), sum(fault.retries for fault in faults)
     were, sent = ("was" if total == 1 else "were" for total in (lost, retries))
     return (
-        f"{count(lost, 'worker')} {were} lost and replaced, and {count(retries, 'chunk')} {sent} sent again, in "
-        f"{count(len(faults), 'generation')}. No result depends on it."
+        f"{counted(lost, 'worker')} {were} lost and replaced, and {counted(retries, 'chunk')} {sent} sent again, in "
+        f"{counted(len(faults), 'generation')}. No result depends on it."
     )
 
 
@@ -167,11 +170,6 @@ def number(value: float) -> str:
     if size and size < 1e-3:
         return f"{value:.2e}"
     return f"{value:.{1 if size >= 100 else 2 if size >= 1 else 3}f}"
-
-
-def count(how_many: int, what: str) -> str:
-    """A number and a noun, such as "1 worker" or "3 workers"."""
-    return f"{how_many:,} {what}{'' if how_many == 1 else 's'}"
 
 
 def duration(seconds: float) -> str:

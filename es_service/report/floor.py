@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.report.markup import Frame, Markup, joined, tag, tick_text, ticks
+from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.geometry import Grid
 
 WIDTH = 520
 MOST_HEIGHT, LEAST_HEIGHT = 560.0, 120.0
 LEFT, TOP, RIGHT, BOTTOM = 52, 8, 10, 40
+
+Range = tuple[float, float]
 
 
 def plan_frame(bounds: Bounds, width: float = WIDTH) -> Frame:
@@ -61,6 +66,30 @@ def walls_and_goal(frame: Frame, task: TaskSpec) -> Markup:
         content.append(tag("circle", tag("title", "goal"), cx=f"{x:.1f}", cy=f"{y:.1f}", r=7, class_="goal"))
         content.append(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=2, class_="goal-middle"))
     return joined(content)
+
+
+def beside_walls(map_: BehaviourMap, task: TaskSpec) -> dict[int, tuple[Range, Range]]:
+    """Cells of a grid in the plane that a wall divides: cell -> the part on the side of its elite.
+
+    At least three tenths of the cell's extent is drawn: a place on an edge belongs to the upper or right cell, so an
+    elite that ended under a wall may be in a cell that lies nearly all behind it. Walls along an axis only.
+    """
+    geometry = map_.geometry
+    if not isinstance(geometry, Grid) or len(geometry.bounds) != 2:
+        return {}
+    parts = {}
+    for cell, place_2 in zip(map_.cell_N.tolist(), map_.descriptor_N_B.tolist(), strict=True):
+        index = geometry.index_of(cell)
+        extents = [(edges[at], edges[at + 1]) for edges, at in zip(geometry.edges, index, strict=True)]
+        for (start, end), (across, along) in product(task.walls or (), ((0, 1), (1, 0))):
+            (low, high), wall = extents[across], start[across]
+            beside = min(start[along], end[along]) <= place_2[along] <= max(start[along], end[along])
+            if wall == end[across] and beside and low <= wall <= high:
+                least = 0.3 * (high - low)
+                below = place_2[across] <= wall
+                extents[across] = (min(low, wall - least), wall) if below else (wall, max(high, wall + least))
+                parts[cell] = (extents[0], extents[1])
+    return parts
 
 
 def is_plan(task: TaskSpec, names: Sequence[str]) -> bool:

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -48,12 +48,20 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
     dimensions = len(map_.geometry.bounds)
     if dimensions == 2:
         frame = floor.plan_frame(map_.geometry.bounds, floor.WIDTH)
-        shapes = (
-            _rectangles(map_, frame, level_N) if isinstance(map_.geometry, Grid) else _voronoi(map_, frame, level_N)
-        )
+        parts = floor.beside_walls(map_, data.task)
+        text = "Each cell shows the fitness of its elite."
+        if isinstance(map_.geometry, Grid):
+            shapes = _rectangles(map_, frame, level_N, parts)
+            text += (
+                " A strip at a wall is an elite that ended there, on the edge of a cell behind the wall."
+                if parts
+                else ""
+            )
+        else:
+            shapes = _voronoi(map_, frame, level_N)
         path = tag("g", class_="path")  # of a chosen cell
         content = [floor.ground(frame, data.names), *shapes, floor.walls_and_goal(frame, data.task), path]
-        return _svg(content, *floor.size(frame)), "Each cell shows the fitness of its elite.", frame
+        return _svg(content, *floor.size(frame)), text, frame
     if dimensions == 1:
         text = "Each bar is a cell; its height is the fitness of its elite."
         return _bars(map_, data.names, level_N, colours), text, None
@@ -100,14 +108,20 @@ def _svg(content: list[Markup], width: float, height: float, class_: str = "map 
                tabindex=0, aria_label="Behaviour map; arrow keys choose a cell")  # fmt: skip
 
 
-def _rectangles(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> list[Markup]:
+def _rectangles(
+    map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64], parts: Mapping[int, tuple[Range, Range]]
+) -> list[Markup]:
     assert isinstance(map_.geometry, Grid)
     across, down = (place(edges) for place, edges in zip((frame.across, frame.down), map_.geometry.edges, strict=True))
-    rectangles = []
+    rectangles, above = [], []
     for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
         i, j = map_.geometry.index_of(cell)
-        rectangles.append(_rectangle(cell, colour, across[i], down[j + 1], across[i + 1], down[j]))
-    return rectangles
+        if cell in parts:
+            (left, right), (bottom, top) = frame.across(parts[cell][0]), frame.down(parts[cell][1])
+            above.append(_rectangle(cell, colour, left, top, right, bottom))
+        else:
+            rectangles.append(_rectangle(cell, colour, across[i], down[j + 1], across[i + 1], down[j]))
+    return rectangles + above
 
 
 def _rectangle(cell: int, colour: int, left: float, top: float, right: float, bottom: float) -> Markup:

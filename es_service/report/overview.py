@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from es_service.errors import counted
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
@@ -49,7 +50,7 @@ def draw_overview(
         solved = "" if threshold is None else f"{summary.solved} of {count} reach {threshold:g}"
         drawn += [plots.centres(run, axes, colours) for run in summary.group.runs]
         axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        axes.set_title(f"{summary.group.name}\n{solved or f'{count} runs'}", fontsize=9, parse_math=False)
+        axes.set_title(f"{summary.group.name}\n{solved or counted(count, 'run')}", fontsize=9, parse_math=False)
     for axes in panels[len(summaries) :]:
         axes.set_axis_off()
     for points in drawn:

@@ -21,7 +21,7 @@ from es_service.report import compare
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
 from es_service.report.detours import detours
-from es_service.report.floor import is_plan
+from es_service.report.floor import beside_walls, is_plan
 from es_service.report.series import X_AXES
 from es_service.runs.view import Run
 from es_service.search.maps.geometry import Grid, intervals
@@ -67,9 +67,14 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
         return bars
     _plane(data, axes)
     if isinstance(geometry, Grid):
-        filled = np.full(geometry.shape, np.nan)
-        for cell, fitness in zip(map_.cell_N, map_.fitness_N, strict=True):
-            filled[geometry.index_of(int(cell))] = fitness
+        filled, parts = np.full(geometry.shape, np.nan), beside_walls(map_, data.task)
+        fitness_of = dict(zip(map_.cell_N.tolist(), map_.fitness_N.tolist(), strict=True))
+        for cell in fitness_of.keys() - parts:
+            filled[geometry.index_of(cell)] = fitness_of[cell]
+        corners = [[(left, low), (right, low), (right, high), (left, high)]
+                   for (left, right), (low, high) in parts.values()]  # fmt: skip
+        beside = np.array([fitness_of[cell] for cell in parts])
+        axes.add_collection(collections.PolyCollection(corners, array=beside, zorder=1.1, **style))
         return axes.pcolormesh(*geometry.edges, filled.T, zorder=1, rasterized=True, **style)
     return axes.scatter(*geometry.centroid_C_B[map_.cell_N].T, c=map_.fitness_N, marker="h", zorder=1, **style)
 

@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from es_service.loop.history import Row
+from es_service.loop.history import Row, evaluated_word
 
 ShowRow = Callable[[Row], None]
 ShowNotice = Callable[[str], None]
@@ -94,9 +94,10 @@ def print_notice(console: Console, notice: str) -> None:
 
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
     """Table of the last generations, and their time by part; fewer columns and rows on a small screen."""
+    evaluated = f"{evaluated_word(recent[-1])} fitness"
     columns: dict[str, Callable[[Row], str]] = {
         "generation": lambda row: str(row["generation"]),
-        "centre fitness": lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
+        evaluated: lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
         "best so far": lambda row: f"{row['best_fitness']:.2f}",
         "env steps": lambda row: short(row["env_steps"]),
         "steps/s": lambda row: short(row["steps_per_second"]),
@@ -128,8 +129,8 @@ def time_by_part(rows: deque[Row] | list[Row]) -> str:
 def plain_line(row: Row) -> str:
     """One generation as one line."""
     return (
-        f"generation {row['generation']}  centre {row['centre_fitness_mean']:.2f}  best {row['best_fitness']:.2f}  "
-        f"env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
+        f"generation {row['generation']}  {evaluated_word(row)} {row['centre_fitness_mean']:.2f}  "
+        f"best {row['best_fitness']:.2f}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
     )
 
 

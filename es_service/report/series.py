@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.loop.history import evaluated_word
 from es_service.report.data import Columns
 from es_service.runs.objectives import objectives, weights
 
@@ -61,14 +62,15 @@ class _Spec(NamedTuple):
     percent: bool = False
 
 
+# {evaluated} is what `evaluated_word` says of the newest generation.
 _SPECS = (
     _Spec(
         "Fitness",
-        "Mean over the evaluation episodes of a centre; of the population, single training episodes with noise. "
+        "Mean over the evaluation episodes of a {evaluated}; of the population, single training episodes with noise. "
         "Corrected: in the new episodes of map.correct_every.",
         (
-            ("best centre so far", "best_fitness", "last"),
-            ("centre", "centre_fitness_mean", "mean"),
+            ("best {evaluated} so far", "best_fitness", "last"),
+            ("{evaluated}", "centre_fitness_mean", "mean"),
             ("population, median", "population_fitness_median", "mean"),
             ("best elite, corrected", "corrected_fitness_max", "held"),
         ),
@@ -76,7 +78,7 @@ _SPECS = (
     ),
     _Spec(
         "Distance to the goal",
-        "In the evaluation episodes of the centre.",
+        "In the evaluation episodes of the {evaluated}.",
         (("at the end, mean", "goal_distance", "mean"), ("on the way, least", "goal_distance_min", "mean")),
     ),
     _Spec(
@@ -96,7 +98,7 @@ _SPECS = (
         (("QD-score", "qd_score", "last"), ("corrected", "corrected_qd_score", "held")),
     ),
     _Spec(
-        "Novelty of the centre",
+        "Novelty of the {evaluated}",
         "Mean distance of its descriptor to the nearest centres evaluated before.",
         (("novelty", "centre_novelty", "mean"),),
     ),
@@ -123,10 +125,12 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
     """The charts of a run that have values, from the columns of its history and of its evaluated centres."""
     ends_K = groups(len(history["generation"]))
     history = {**history, **weight_columns(history["generation"], centres)}
+    newest = {name: values_G[-1] for name, values_G in history.items() if values_G.size}
+    word = evaluated_word(newest) if newest else "centre"
     chart_list = []
     for spec in _SPECS:
         lines = tuple(
-            Line(label, thinned(history[column], ends_K, group))
+            Line(label.format(evaluated=word), thinned(history[column], ends_K, group))
             for label, column, group in spec.lines
             if column in history and np.isfinite(history[column]).any()
         )
@@ -136,7 +140,9 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
         if spec.band is not None and np.isfinite(history.get(spec.band[1], np.full(1, np.nan))).any():
             label, low, high = spec.band
             band = (label, thinned(history[low], ends_K, "mean"), thinned(history[high], ends_K, "mean"))
-        chart_list.append(Chart(spec.title, spec.note, lines, band, spec.percent))
+        chart_list.append(
+            Chart(spec.title.format(evaluated=word), spec.note.format(evaluated=word), lines, band, spec.percent)
+        )
     return chart_list
 
 

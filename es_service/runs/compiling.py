@@ -29,7 +29,8 @@ MOST_FILES = 1000
 
 
 def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
-    """That workers compile for a kind of chunk, and about how long it takes; that they start, if they compile nothing.
+    """That workers compile for a kind of chunk, or load what they have compiled before, and about how long it takes.
+    That they start, if they compile nothing.
 
     Args:
         here: whether they are on this machine; of others it is not known what they have on disk.
@@ -37,12 +38,9 @@ def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
     first_s, again_s = BACKENDS[spec.rollout].compile_s
     if not first_s:
         return f"starting workers for {spec.environment} ({CONTENTS[kind]})"
-    if not here:
-        how_long = f"about {first_s} s the first time"
-    elif was_compiled(spec, kind):
-        how_long = f"compiled before, about {again_s} s"
-    else:
-        how_long = f"first time, about {first_s} s"
+    if here and was_compiled(spec, kind):
+        return f"loading compiled code for {spec.environment} ({CONTENTS[kind]}, about {again_s} s)"
+    how_long = f"first time, about {first_s} s" if here else f"about {first_s} s the first time"
     return f"compiling for {spec.environment} ({CONTENTS[kind]}, {how_long})"
 
 

@@ -17,9 +17,10 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import Action, EvaluationError, Interrupted, ServiceError, StoreError, WayOut
+from es_service.errors import Action, EvaluationError, Interrupted, ServiceError, StoreError, WayOut, counted
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
+from es_service.loop.history import evaluated_word
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
@@ -162,11 +163,12 @@ def work(
             log(Committed(row["generation"]))
             tell_notices()
             if lost := row["lost_workers"]:
-                who = "a worker" if lost == 1 else f"{lost} workers"
+                who = "a worker" if lost == 1 else counted(lost, "worker")
                 tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
             answer = on_generation(row)
             _LOG.info(
-                "centre fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
+                "%s fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
+                evaluated_word(row),
                 row["centre_fitness_mean"],
                 row["best_fitness"],
                 row["env_steps"],
@@ -176,7 +178,7 @@ def work(
             return answer
 
         if compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
-            tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
+            tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
         state, reason = driver.run(search, engine, recorder, state, after_generation, tell_failed)

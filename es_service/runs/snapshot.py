@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -52,9 +52,9 @@ class Policy:
     """
 
     spec: PolicySpec
-    parameters_D: FloatArray
-    observation_mean_O: FloatArray
-    observation_std_O: FloatArray
+    parameters_D: FloatArray = field(repr=False)
+    observation_mean_O: FloatArray = field(repr=False)
+    observation_std_O: FloatArray = field(repr=False)
     observation_clip: float | None
 
     def __call__(self, observation: Any) -> FloatArray:

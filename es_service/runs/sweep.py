@@ -20,7 +20,7 @@ from typing import IO, Literal
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
-from es_service.errors import Interrupted, RunLockedError, StoreError
+from es_service.errors import Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, spent
 from es_service.loop.history import Row
@@ -125,7 +125,7 @@ def run_planned(
             _given(run, workers, inside, options) for run, workers in zip(left, shares.workers, strict=True)
         )
         if left:
-            todo = f"{len(left)} of {len(runs)} runs to do in {out}, {shares.at_once} at a time"
+            todo = f"{len(left)} of {counted(len(runs), 'run')} to do in {out}, {shares.at_once} at a time"
             on_notice(f"{todo}; workers of each: {' or '.join(dict.fromkeys(map(str, shares.workers)))}")
         running: dict[str, _Child] = {}
         shown, read_s = None, float("-inf")

@@ -14,7 +14,7 @@ from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import in_line, plain, show
-from es_service.errors import ConfigError, Problem, StoreError
+from es_service.errors import ConfigError, Problem, StoreError, counted
 from es_service.runs.checked_config import changes_from, load_config
 from es_service.runs.view import open_run
 from es_service.store.folder import holds_run
@@ -92,7 +92,7 @@ def plan(
 
 
 def _refused(source: Source, problems: Sequence[Problem]) -> ConfigError:
-    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    count = counted(len(problems), "problem")
     return ConfigError.listing(f"{'config' if isinstance(source, Mapping) else source}: {count}", problems)
 
 

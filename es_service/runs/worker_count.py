@@ -13,7 +13,7 @@ from es_service.config.model import RunConfig
 from es_service.config.parallel import chunks_at_once
 from es_service.dispatch.cores import cores
 from es_service.dispatch.gpus import places
-from es_service.errors import ConfigError, WayOut
+from es_service.errors import ConfigError, WayOut, counted
 
 GPU = f"{RESOURCES}gpu"
 
@@ -60,7 +60,7 @@ def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
     allowed = compute.max_workers_per_core * count
     if compute.workers <= allowed:
         return
-    here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
+    here = f"this machine, which has {counted(count, 'core')} for them"
     cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
     ways_out = (
         []

@@ -172,7 +172,7 @@ def changes(extra: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Ar
 
 
 def from_parts(parts: Mapping[str, Arrays]) -> Mapping[str, Any]:
-    """The values whose pieces are among the parts of a state; inverse of `changes(own, {})`."""
+    """The values whose pieces are among the parts of a state; inverse of `changes(extra, {})`."""
     values: dict[str, Any] = dict(parts.get(OWN, {}))
     numbered: dict[str, dict[int, Arrays]] = {}
     for name, arrays in parts.items():

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from es_service.errors import ServiceError
+from es_service.errors import ServiceError, counted
 from es_service.report.compare_page import comparison_sections
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -57,9 +57,11 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
     """What draws the list of all runs."""
 
     def draw() -> Picture:
-        summaries = runs.summaries()
-        running = sum(summary.status is not None and summary.status.driver is not None for summary in summaries)
-        said = f"{len(summaries):,} runs, of which {running:,} are running." if summaries else "There is no run yet."
+        summaries = sorted(runs.summaries(), key=lambda summary: not _is_running(summary))  # these first, else by name
+        running = sum(map(_is_running, summaries))
+        said = (
+            f"{counted(len(summaries), 'run')}, {running:,} of them running." if summaries else "There is no run yet."
+        )
         rows = [tag("tr", *_row(summary)) for summary in summaries]
         heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
         listed = tag("div", tag("table", heads, tag("tbody", *rows), class_="runs"), class_="scroll") if rows else None
@@ -68,6 +70,10 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
         return Picture("Runs", {"runs": tag("section", form, id="runs")}, {})
 
     return draw
+
+
+def _is_running(summary: Summary) -> bool:
+    return summary.status is not None and summary.status.driver is not None
 
 
 def _row(summary: Summary) -> list[Markup]:

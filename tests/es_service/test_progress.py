@@ -6,7 +6,7 @@ from collections import deque
 import pytest
 from rich.console import Console
 
-from es_service.report.progress import live_table, show_progress
+from es_service.report.progress import live_table, plain_line, show_progress
 
 ROW = {
     "generation": 123456,
@@ -18,6 +18,7 @@ ROW = {
     "steps_per_second": 4_567_890.0,
     "invalid_members": 0,
     "lost_workers": 1,
+    "update_norm": 0.5,
     **{f"seconds_{part}": 0.1 for part in ("rollout", "gradient", "evaluation", "driver", "store")},
 }
 
@@ -49,3 +50,20 @@ def test_where_no_table_can_be_shown_lines_come_at_once(terminal, environment):
         "workers replaced 1",
         "note: a worker was lost",
     ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({}, "centre"),
+        ({"generation": 0, "update_norm": None}, "centre"),
+        ({"update_norm": None}, "policy"),
+        ({"update_norm": float("nan")}, "policy"),
+    ],
+)
+def test_a_generation_that_moves_no_centre_shows_its_fittest_policy(changes, word):
+    row, console = ROW | changes, Console(width=80, force_terminal=False)
+    assert f"  {word} -1234.56  best -1234.56  " in plain_line(row)
+    with console.capture() as capture:
+        console.print(live_table("runs/a", deque([row]), 80, 24))
+    assert f"{word} fitness" in capture.get()

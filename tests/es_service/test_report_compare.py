@@ -16,6 +16,7 @@ from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
 from es_service.report.facts import number
 from es_service.report.figures import empty_figure, write_figures
+from es_service.report.floor import beside_walls
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
 from tests.database import execute
@@ -253,10 +254,13 @@ def axes():
 def test_a_plot_of_a_map_has_its_values_where_they_are(folders, runs, axes):
     mesh = plots.behaviour_map(open_run(folders[0]), axes)
     filled = np.ma.filled(mesh.get_array().reshape(20, 20).astype(float), np.nan)  # rows are y
-    map_ = runs[0].map
-    i, j = map_.geometry.index_of(int(map_.cell_N[5]))
-    assert filled[j, i] == map_.fitness_N[5]
-    assert np.isfinite(filled).sum() == map_.size
+    map_, parts = runs[0].map, beside_walls(runs[0].map, runs[0].task)
+    whole_N = np.array([cell not in parts for cell in map_.cell_N])
+    for cell, fitness in zip(map_.cell_N[whole_N], map_.fitness_N[whole_N], strict=True):
+        i, j = map_.geometry.index_of(int(cell))
+        assert filled[j, i] == fitness
+    assert np.isfinite(filled).sum() == whole_N.sum()
+    assert np.array_equal(axes.collections[0].get_array(), map_.fitness_N[~whole_N])
     assert len(axes.lines) == 3  # two walls and the goal
 
 

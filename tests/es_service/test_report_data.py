@@ -162,6 +162,7 @@ def test_what_all_centres_climb_is_drawn_if_it_differs(weights, title, lines):
     ]
     columns = dict(zip(("generation", "fitness_weight", "update_norm"), np.array(rows).T, strict=True))
     history = {"generation": np.arange(len(weights) + 1.0), "fitness_weight": np.ones(len(weights) + 1)}
+    history["update_norm"] = np.ones(len(weights) + 1)
     charts = series.charts(history, columns)
     assert [chart.title for chart in charts] == ([] if title is None else [title])
     found = {line.label: line.y_K for chart in charts for line in chart.lines}

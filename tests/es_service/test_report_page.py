@@ -16,7 +16,7 @@ import pytest
 from es_service.cli.commands import error_message
 from es_service.errors import StoreError
 from es_service.protocol.options import choice
-from es_service.report import maps
+from es_service.report import floor, maps
 from es_service.report.colours import LEVELS, SCALE, level
 from es_service.report.data import read_run
 from es_service.report.markup import Frame, Markup, data_script, tag, tick_text, ticks
@@ -161,6 +161,21 @@ def test_cells_and_paths_are_drawn_where_they_are(tmp_path):
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     assert (low >= [x - 0.1, y - 0.1]).all()
     assert (high <= [x + 20 * width + 0.1, y + 20 * height + 0.1]).all()
+
+
+def test_of_a_cell_that_a_wall_divides_the_side_of_its_elite_is_drawn(tmp_path):
+    """PointMaze's walls are at y = -0.495, from x = -0.5, and at y = 0.205, up to x = 0.5; cells are 0.1 high."""
+    data = read_run(write_run(tmp_path / "run", filled=1.0))
+    cells = [data.map.geometry.cell_at(place) for place in ((3, 12), (7, 12), (17, 12), (9, 5), (9, 4))]
+    descriptor_N_B = data.map.descriptor_N_B.copy()
+    descriptor_N_B[cells] = [(-0.65, 0.2), (-0.25, 0.25), (0.75, 0.2), (-0.05, -0.5), (-0.05, -0.55)]
+    drawn = floor.beside_walls(replace(data.map, descriptor_N_B=descriptor_N_B), data.task)
+    (left, right), (bottom, top) = drawn[cells[0]]
+    assert (left, right, bottom, top) == pytest.approx((-0.7, -0.6, 0.175, 0.205)), "under the wall, at the edge"
+    assert drawn[cells[1]][1] == pytest.approx((0.205, 0.3)), "above it"
+    assert cells[2] not in drawn, "beside the end of the wall"
+    assert drawn[cells[3]][1] == pytest.approx((-0.525, -0.495))
+    assert cells[4] not in drawn
 
 
 def test_voronoi_cells_fill_the_map_and_hold_their_centroids(tmp_path):

@@ -115,7 +115,7 @@ def test_a_note_says_how_many_workers_start_where_not_all_have_work(tmp_path):
     notices: list[str] = []
     few = {"search.pairs": 16, "search.evaluation_episodes": 20, "compute.max_workers_per_core": 4}
     api.run(load_config(CONFIG, {**few, "compute.workers": 3}), tmp_path / "run", on_notice=notices.append)
-    assert [notice.partition(",")[0] for notice in notices] == ["compute.workers: 2 workers start and not 3"]
+    assert [notice.partition(",")[0] for notice in notices] == ["compute.workers: 2 of 3 start"]
 
 
 @pytest.mark.parametrize(

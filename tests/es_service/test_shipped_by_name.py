@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from es_service import load_config
 from es_service.api import default_folder
 from es_service.cli.main import app
-from es_service.config.shipped import config_file, shipped_configs, shipped_text
+from es_service.config.shipped import config_file, first_sentence, shipped_configs, shipped_text
 from es_service.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -30,6 +30,14 @@ def test_a_name_is_taken_where_no_such_file_exists(tmp_path, monkeypatch):
     assert config_file("configs/point_maze_me_es.yaml") == Path("configs/point_maze_me_es.yaml"), "a path is a path"
     Path("point_maze_me_es").write_text("search: {}")
     assert config_file("point_maze_me_es") == Path("point_maze_me_es")
+
+
+def test_a_config_is_described_by_its_whole_first_sentence():
+    first = {name: first_sentence(file.read_text()) for name, file in shipped_configs().items()}
+    assert all(sentence.endswith(".") for sentence in first.values())
+    assert first["ant_maze_memes"].endswith(" the direct path ends in a pocket.")
+    assert first_sentence("# A. B.\n# C.\na: 1  # D") == "A. B."
+    assert first_sentence("a: 1") == ""
 
 
 @pytest.mark.parametrize("missing", ["point_maze_me_e", "point_maze_me_es.yml", "configs/point_maze_me_es.yaml"])

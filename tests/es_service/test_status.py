@@ -62,7 +62,7 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
 
 def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, monkeypatch, capsys):
     run = api.open_run(write_run(tmp_path / "run", generations=20))  # its only faults are those of generation 5
-    counted = "\nfaults handled     1 workers replaced, 2 chunks sent again"
+    counted = "\nfaults handled     1 worker replaced, 2 chunks sent again"
     for most, expected in ((1000, [f"{counted}\n"]), (16, [f"{counted} in the last 16 generations\n"]), (15, [])):
         for module in (recent, status):
             monkeypatch.setattr(module, "FAULTS_OF", most)

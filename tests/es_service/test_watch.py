@@ -21,6 +21,7 @@ from es_service.report.page import run_sections
 from es_service.report.write import python_call
 from es_service.store import connection, upkeep, writer
 from es_service.store.codec import text_sha256
+from es_service.store.lock import acquire_lock
 from es_service.watch import channels
 from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
@@ -402,6 +403,19 @@ def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
     assert reading.data is not None
     assert reading.data.history["generation"].tolist() == [0, 1, 2, 3, 4]
     assert "generations 5 to 20" in reading.data.problems[0]
+
+
+def test_running_runs_come_first(tmp_path):
+    for name in ("a", "b", "c"):
+        write_run(tmp_path / name)
+    app = site(tmp_path).app(None)
+    lock = acquire_lock(tmp_path / "b")
+    try:
+        html = sections(app, "/events/list")["sections"]["runs"]["html"]
+    finally:
+        lock.release()
+    assert "3 runs, 1 of them running." in html
+    assert re.findall(r'">[^<]*/([abc])</a>', html) == ["b", "a", "c"]
 
 
 def test_a_run_with_forged_data_hides_no_other(tmp_path):

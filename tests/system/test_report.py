@@ -230,7 +230,9 @@ def test_a_comparison_is_shown_and_different_tasks_are_refused(page, tmp_path):
     runs = [write_run(tmp_path / f"run{seed}", {"seed": seed}) for seed in range(3)]
     code, printed = es("report", *runs, "--out", tmp_path / "all.html", "--group-by", "seed", "--threshold", "-70")
     assert (code, printed.strip()) == (0, str(tmp_path / "all.html"))
-    page.open(tmp_path / "all.html")
+    page.open(tmp_path / "all.html", 1200)
+    table = "document.querySelector('#final .scroll')"
+    assert page.value(f"{table}.scrollWidth <= {table}.clientWidth"), "no column is cut off"
     page.move(".chart .x-env_steps", 0.5)
     assert "environment steps: seed 0 -" in page.text(".chart .at")
     page.click('input[value="wall_clock_s"]')

@@ -139,6 +139,11 @@ def test_a_policy_with_a_memory_is_called_through_start():
     np.testing.assert_array_equal(plain.start()([0.1, 0.2]), plain([0.1, 0.2]))
 
 
+def test_a_policy_is_shown_without_its_weights():
+    shown = repr(recurrent(PolicySpec((2, 4, 1))))
+    assert shown == f"Policy(spec={PolicySpec((2, 4, 1))!r}, observation_clip=None)"
+
+
 def require_bits_of_each() -> None:
     """An observation has the same action alone, in a batch, and as every second number of a longer array."""
     for policy in (PolicySpec((2, 6, 2), "relu", "linear"), PolicySpec((29, 256, 8)), PolicySpec((7, 5, 3), memory=6)):

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from es_service.config.presets import PRESETS, preset_table
-from es_service.config.shipped import shipped_configs
+from es_service.config.shipped import first_sentence, shipped_configs
 from es_service.config.yaml_text import show
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
@@ -16,7 +16,7 @@ from es_service.search.algorithms import ALGORITHMS
 
 
 def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
-    """Print tables of tasks, algorithms, the keys on which presets differ, and shipped configs."""
+    """Print tables of tasks, algorithms, the values of presets, and shipped configs."""
     tasks = _table("tasks (task.environment)")
     for task in known_tasks.values():
         tasks.add_row(task.name, _about(task))
@@ -33,7 +33,9 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/user_method.py.")
     console.print(algorithms)
 
-    presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")
+    presets = Table(
+        title="presets (search.preset): what they fill in where a config leaves it out", title_justify="left"
+    )
     presets.add_column("key")
     for name in PRESETS:
         presets.add_column(name)
@@ -44,7 +46,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
 
     configs = _table("configs (es-service run NAME, es-service config NAME)")
     for name, file in shipped_configs().items():
-        configs.add_row(name, file.read_text().splitlines()[0].lstrip("# "))
+        configs.add_row(name, first_sentence(file.read_text()))
     console.print(configs)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from es_service.cli.console import print_line
+from es_service.errors import counted
 from es_service.runs.certified import Certified
 
 
@@ -28,7 +29,7 @@ def certified_line(row: Mapping[str, Any]) -> str:
     chosen = (
         f"first of {row['candidates']:,}" if row["rank"] == 0 else f"number {row['rank'] + 1} of {row['candidates']:,}"
     )
-    return f"{', '.join(parts)}; {row['episodes']:,} episodes, {chosen} by {row['selected_by']}"
+    return f"{', '.join(parts)}; {counted(row['episodes'], 'episode')}, {chosen} by {row['selected_by']}"
 
 
 def _mean(what: str, row: Mapping[str, Any], name: str) -> str:

@@ -9,7 +9,8 @@ from rich.console import Console
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
 from es_service.cli.tables.certified import certified_line
-from es_service.errors import StoreError
+from es_service.errors import StoreError, counted
+from es_service.loop.history import evaluated_word
 from es_service.report.progress import plain_line
 from es_service.runs.certified import newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
@@ -39,7 +40,7 @@ def print_status(console: Console, run: Run) -> None:
     method = (constants["search.algorithm"], population_size(constants))
     fields = {
         "run": str(run.folder),
-        "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
+        "task": f"{constants['task.environment']}, {counted(constants['task.episode_steps'], 'step')} an episode",
         "search": ", ".join(filter(None, [*method, f"seed {constants['seed']}"])),
     }
     if where := run.meta.task.get("does_not_repeat"):
@@ -99,20 +100,23 @@ def _progress(status: RunStatus) -> dict[str, str]:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, minimum {last['goal_distance_min']:.3f}"
     filled = {}
     if "map_cells" in last:
-        filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
+        filled["map"] = (
+            f"{counted(last['map_cells'], 'cell')}, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
+        )
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     recent = read_recent(status.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
+    steps = f"{last['env_steps']:,}{of.get('env_steps', '')}"
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
         "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
-        "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
+        f"{evaluated_word(last)} fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
         **filled,
-        "novelty archive": f"{last['archive_size']:,} centres",
+        "novelty archive": counted(last["archive_size"], "centre"),
         **_objectives(status.run, recent),
-        "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
+        "environment steps": f"{steps} in {counted(last['episodes'], 'episode')}",
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
         **_faults(recent, last["generation"]),
     }
@@ -168,7 +172,8 @@ def _faults(recent: Recent, generation: int) -> dict[str, str]:
     if not recent.lost_workers and not recent.retries:
         return {}
     where = f" in the last {FAULTS_OF:,} generations" if generation >= FAULTS_OF else ""
-    return {"faults handled": f"{recent.lost_workers} workers replaced, {recent.retries} chunks sent again{where}"}
+    faults = f"{counted(recent.lost_workers, 'worker')} replaced, {counted(recent.retries, 'chunk')} sent again"
+    return {"faults handled": f"{faults}{where}"}
 
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:

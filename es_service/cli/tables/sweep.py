@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from es_service.cli.console import print_line
+from es_service.errors import counted
 from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import OnProgress, SweptRun
 
@@ -66,7 +67,7 @@ def count_line(runs: Sequence[SweptRun]) -> str:
     """How many runs are in each state, such as "12 runs: 2 running, 10 waiting"."""
     counts = Counter(run.state for run in runs)
     states = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    return f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {states}"
+    return f"{counted(len(runs), 'run')}: {states}"
 
 
 def _of(run: SweptRun, column: str, limit: str) -> str:

@@ -118,7 +118,7 @@ def first_state(
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
-        own: `Algorithm.extra`.
+        extra: `Algorithm.extra`.
         search: settings with the kind of the steps; None for a search without steps.
     """
     states = tuple(CentreState(centre_D, fresh_state(search, centre_D.size)) for centre_D in centres)
