@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 from es_service.config.compute import implied_by
-from es_service.config.fields import TASK_OPTIONS
+from es_service.config.fields import TASK_OPTIONS, as_tuple
 from es_service.config.keys import FIELDS
 from es_service.config.methods import (
     KIND,
@@ -18,8 +18,12 @@ from es_service.config.methods import (
     filled_in,
     has_effect,
     kinds_without,
+    only_centres,
     parts_of,
+    search_fields,
 )
+from es_service.config.presets import preset_rows
+from es_service.config.resolution import LEFT_OPEN
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
@@ -43,6 +47,8 @@ STATE_KEYS = (
     "map.cells",
 )
 """Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
+_CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}
+"""Keys of which a method has no default of its own."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
 """Keys that are used only when a run starts."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
@@ -108,14 +114,77 @@ def foreign_keys(
     if other := is_replaced("search.algorithm"):
         known = values if ":" in str(values.get("search.algorithm")) else all_search_fields(algorithms)
         known = {*known, *settings.unused}
-        why = f"{wanted['search.algorithm']} replaces its algorithm"
+        why = _replaces("search.algorithm", wanted["search.algorithm"])
         foreign |= {key: why for key in values if key in known and not has_effect(key, settings)}
     for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
         if other or is_replaced(kind):
-            why = f"{chosen[kind]} replaces its {kind}"
+            why = _replaces(kind, chosen[kind])
             own = [key for key in values if key.startswith(kind.removesuffix(KIND))]
             foreign |= {key: why for key in own if kinds_without(key, chosen[kind], settings)}
     return {key: why for key, why in foreign.items() if key not in wanted}
+
+
+def _replaces(key: str, value: Any) -> str:
+    return f"{value} replaces its {'algorithm' if key == 'search.algorithm' else key}"
+
+
+@dataclass(frozen=True)
+class KeptValue:
+    """A value that a config gives to a key, although what it was written for has been replaced."""
+
+    value: Any
+    default: Any
+    """What the key would have without it."""
+    replaced: str
+    """The key that overrides have changed: `search.algorithm`, or the kind of a part."""
+    by: str
+    """The value of that key now."""
+
+    @property
+    def why(self) -> str:
+        """What is replaced, as a clause."""
+        return _replaces(self.replaced, self.by)
+
+
+def kept_values(
+    values: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    settings: type[SearchConfig],
+    algorithms: Methods,
+    by_task: Mapping[str, Any],
+) -> dict[str, KeptValue]:
+    """Keys of a config that stay as they are although `wanted` replaces the method, or the kind of a part, for which
+    they were written, and that the new one has another default for.
+
+    Args:
+        settings: those of the method with `wanted`.
+        by_task: values that the task fills in.
+    """
+    given, before = {**values, **wanted}, filled_in(values, settings) | dict(values)
+    filled = dict(by_task) | filled_in({**by_task, **given}, settings)
+    methods = (settings, *(method.settings for method in algorithms.values()))
+    declared = {*search_fields(settings), *(row.key for method in methods for row in preset_rows(method))} - _CHOSEN
+    gone = foreign_keys(values, wanted, settings, algorithms)
+    kept: dict[str, KeptValue] = {}
+    for key in (key for key in values if key in declared and key not in wanted and key not in gone):
+        chosen_by = ("search.algorithm", f"{key.rpartition('.')[0]}.{KIND}")
+        replaced = [name for name in chosen_by if wanted.get(name, before.get(name)) != before.get(name)]
+        if replaced and has_effect(key, settings):
+            default = filled[key] if key in filled else _default_with(key, filled | given, settings)
+            if default != ABSENT and as_tuple(values[key]) not in (default, LEFT_OPEN.get(key, ABSENT)):
+                kept[key] = KeptValue(values[key], default, replaced[0], show(wanted[replaced[0]]))
+    return kept
+
+
+def _default_with(key: str, chosen: Mapping[str, Any], settings: type[SearchConfig]) -> Any:
+    """The default of a key with a method and the chosen kinds of its parts; ABSENT if it has none."""
+    if key == "search.centres":
+        return only_centres(chosen, settings) or settings.first_centres
+    part, _, leaf = key.rpartition(".")
+    kinds, kind = parts_of(settings).get(part, {}), chosen.get(f"{part}.{KIND}")
+    fields = kinds[kind].model_fields if isinstance(kind, str) and kind in kinds else {}
+    field = fields.get(leaf) or search_fields(settings).get(key)
+    return _default(key) if field is None else ABSENT if field.is_required() else field.default
 
 
 def changed_constants(

@@ -7,6 +7,7 @@ that fails a step is reported once and removed, so that the later steps still ch
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Mapping
 from types import FunctionType, NoneType, UnionType
@@ -15,7 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from es_service.config.changes import foreign_keys, without_derived
+from es_service.config.changes import KeptValue, foreign_keys, kept_values, without_derived
 from es_service.config.fields import TASK_OPTIONS, as_tuple
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
@@ -94,10 +95,39 @@ def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[
 
     `source` and `overrides` must be ones that `load_config` accepts.
     """
-    mapping = source if isinstance(source, Mapping) else read_config(source)
-    values, wanted = sort_keys(mapping)[0], parse_overrides(overrides)[0]
+    values, wanted = _given(source, overrides)
     method = algorithms[{**values, **wanted}["search.algorithm"]]
     return foreign_keys(values, wanted, method.settings, algorithms)
+
+
+def kept(
+    source: Source, overrides: Overrides, *, tasks: Mapping[str, TaskSpec], algorithms: Methods
+) -> dict[str, KeptValue]:
+    """Keys of a config whose values replace other defaults of the algorithm, or of the kind of a part, that the
+    overrides choose in the place of its own.
+
+    Nothing of a config whose algorithm is unknown. Raises ConfigError if `source` cannot be read.
+    """
+    values, wanted = _given(source, overrides)
+    task, method = (str({**values, **wanted}.get(key)) for key in ("task.environment", "search.algorithm"))
+    by_task: dict[str, Any] = {}
+    with contextlib.suppress(KeyError, ConfigError):
+        by_task = values_of_task(_looked_up(tasks, task, values, wanted))
+    try:
+        return kept_values(values, wanted, algorithms[method].settings, algorithms, by_task)
+    except (KeyError, ConfigError):
+        return {}
+
+
+def _given(source: Source, overrides: Overrides) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Values by dotted key of a source, and of overrides."""
+    mapping = source if isinstance(source, Mapping) else read_config(source)
+    return sort_keys(mapping)[0], parse_overrides(overrides)[0]
+
+
+def _looked_up(known: Mapping[str, Any], name: str, values: Mapping[str, Any], wanted: Mapping[str, Any]) -> Any:
+    """The task, with what a config chooses for it, or the method of a name."""
+    return known.chosen(name, **settings_of_task(values, wanted)) if isinstance(known, Tasks) else known[name]
 
 
 def changed_config(
@@ -155,12 +185,8 @@ def _load(
         if key not in chosen and key.split(".")[0] not in unusable:
             unknown.append(problem_of(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
         try:
-            if not isinstance(given, str) or not given:
-                selected[key] = None
-            elif isinstance(known, Tasks):
-                selected[key] = known.chosen(given, **settings_of_task(values, wanted))
-            else:
-                selected[key] = known[given]
+            named = isinstance(given, str) and given != ""
+            selected[key] = _looked_up(known, str(given), values, wanted) if named else None
         except KeyError:
             allowed, meant = f"{one_of(known)}, or {besides}", nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""

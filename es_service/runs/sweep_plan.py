@@ -10,13 +10,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from es_service.config.changes import KeptValue
 from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.loading import Source
+from es_service.config.loading import Source, kept
 from es_service.config.model import RunConfig
+from es_service.config.problems import one_of
+from es_service.config.tasks import TASKS
 from es_service.config.yaml_text import in_line, plain, show
 from es_service.errors import ConfigError, Problem, StoreError, counted
 from es_service.runs.checked_config import changes_from, load_config
 from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.store.folder import holds_run
 
 SEED = "seed"
@@ -59,7 +63,9 @@ def plan(
 
     Raises:
         ConfigError: a config, the grid or the seeds are wrong (all problems are listed), or the folder of a run holds
-            a run with other settings, or `out` is a run itself.
+            a run with other settings, or `out` is a run itself. So is a value of the config that only one of several
+            methods (or kinds of a part) of the grid was given it for, where others have another default: `grid` or
+            `overrides` must have its key.
     """
     if here and holds_run(out):
         raise ConfigError(f"{out} is the folder of a run; choose another folder for the sweep", field="out", run=out)
@@ -76,14 +82,20 @@ def plan(
         raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
     planned: list[PlannedRun] = []
     wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
+    stays: dict[str, list[KeptValue]] = {}
     for name, settings in named.items():
         wanted, folder = {**common, **settings}, out / name
         try:
+            for key, value in kept(source, wanted, tasks=TASKS, algorithms=ALGORITHMS).items():
+                if len(grid.get(value.replaced, ())) > 1:
+                    stays.setdefault(key, []).append(value)
             new = here and not holds_run(folder)
             planned.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new)))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
+    named_already = {problem.field for problem in wrong.values()}
+    wrong |= {key: _kept_problem(key, values) for key, values in stays.items() if key not in named_already}
     if wrong:
         raise _refused(source, list(wrong.values()))
     for run in planned if here else ():
@@ -111,6 +123,18 @@ def _axis_problems(axes: Mapping[str, Sequence[Any]], has_seed: bool, common: Ma
             what = f"it has values in the sweep, and {show(common[key])} for all runs; leave one out"
             problems.append(Problem(f"{key}: {what}", key, common[key]))
     return problems
+
+
+def _kept_problem(key: str, kept: Sequence[KeptValue]) -> Problem:
+    """The problem of a value of the config that other methods, or kinds of a part, would have in the place of their
+    own defaults."""
+    value, methods = kept[0].value, {}
+    for one in kept:
+        methods.setdefault(show(one.default), {})[one.by] = None
+    defaults = one_of([f"{default} with {one_of(names, 'and')}" for default, names in methods.items()], "and")
+    what = f"the config has {show(value)} for another {kept[0].replaced}, and the default is {defaults}"
+    hint = f"set it for all runs of the sweep, such as {key}={in_line(value)}"
+    return Problem(f"{key}: {what}; {hint}", key, value, suggestion=value)
 
 
 def _name(settings: Mapping[str, Any]) -> str:

@@ -5,21 +5,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import pytest
 
 from es_service import api
 from es_service.cli.options import print_config_notes
-from es_service.config.loading import left_out
+from es_service.config.loading import kept, left_out
 from es_service.config.methods import all_search_fields, has_effect, methods_with
 from es_service.config.model import flat
 from es_service.config.shipped import shipped_configs
+from es_service.config.tasks import TASKS
 from es_service.config.yaml_text import dump_yaml, parse_value, read_yaml_file
 from es_service.errors import ConfigError
+from es_service.protocol.messages import TaskSpec
+from es_service.protocol.parameters import FREE, ParameterSpec
 from es_service.runs.lineage import fork_config
 from es_service.runs.sweep_plan import plan
-from es_service.search.algorithms import OURS
+from es_service.search.algorithms import ALGORITHMS, OURS
 from tests.es_service.config_examples import MINIMAL, load
 from tests.es_service.test_shipped_configs import ALL
+from workers.environments import SHIPPED
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -155,6 +162,106 @@ def test_keys_that_are_left_out_are_named_on_the_command_line(tmp_path, capsys):
     printed = " ".join("".join(capsys.readouterr()).split())
     assert f"note: ignored task.options.start of {file}, since ant_maze replaces its task" in printed
     assert f"note: ignored search.batch of {file}, since es replaces its algorithm" in printed
+
+
+def found(source, *wanted, tasks: Mapping[str, TaskSpec] = TASKS):
+    """What stays: key -> (value, default of what has been chosen)."""
+    return {
+        key: (one.value, one.default) for key, one in kept(source, wanted, tasks=tasks, algorithms=ALGORITHMS).items()
+    }
+
+
+def test_values_that_replace_other_defaults_of_the_chosen_method_are_found():
+    search = {"algorithm": "me_es", "sigma": 0.3, "evaluation_episodes": 30, "centres": 4, "emitters": 4, "pairs": 512}
+    source = MINIMAL | {"search": search | {"step": {"learning_rate": 0.01, "l2": 0}}, "policy": {"action_noise": 0.01}}
+    to_map_elites = {"search.evaluation_episodes": (30, 1), "search.centres": (4, 32)}
+    assert found(source, "search.algorithm=map_elites") == to_map_elites
+    assert found(source, "search.algorithm=map_elites", "search.centres=4") == {"search.evaluation_episodes": (30, 1)}
+    assert found(source, "search.algorithm=es") == {
+        "search.sigma": (0.3, 0.02),
+        "search.centres": (4, 1),
+        "search.step.l2": (0, 0.005),
+    }
+    assert found(source, "search.algorithm=ars")["policy.action_noise"] == (0.01, 0.0)  # a key of another section
+    assert "search.step.l2" not in found(source, "search.algorithm=ars")  # whose default it is
+    assert found(source, "search.algorithm=me_es") == found(source, "search.sigma=0.1") == {}
+    of_map_elites = MAP_ELITES | {"policy": {"observation_normalization": False}}
+    assert found(of_map_elites, "search.algorithm=es") == {
+        "search.centres": (4, 1),
+        "policy.observation_normalization": (False, True),
+    }
+    assert (
+        found(source | {"search": {"algorithm": "es", "preset": "uber", "centres": "auto"}}, "search.algorithm=me_es")
+        == {}
+    )
+
+
+def test_the_defaults_are_those_of_the_preset_and_of_the_task_with_which_the_run_is():
+    source = MINIMAL | {"search": {"algorithm": "es", "pairs": 512}}
+    assert found(source, "search.algorithm=nsr_es", "search.preset=uber") == {"search.pairs": (512, 5000)}
+    once = {"search": {"algorithm": "me_es", "evaluation_episodes": 1}, "task": {"environment": "rastrigin"}}
+    deterministic = {
+        "rastrigin": replace(
+            SHIPPED["point_maze"], parameters=ParameterSpec(("a",), (FREE,), (0.0,)), deterministic=True
+        )
+    }
+    assert found(once, "search.algorithm=es", tasks=deterministic) == {}
+    assert found(once, "search.algorithm=es") == {"search.evaluation_episodes": (1, 30)}  # of a task that is not known
+
+
+def test_values_that_replace_other_defaults_of_a_chosen_kind_are_found():
+    source = MINIMAL | {"search": {"algorithm": "map_elites", "elites": {"kind": "eme", "depth": 8, "again": 0.25}}}
+    assert found(source, "search.elites.kind=archive_sampling") == {
+        "search.elites.depth": (8, 2),
+        "search.elites.again": (0.25, "all"),
+    }
+    assert found(source, "search.elites.kind=eme") == found(source, "search.elites.kind=once") == {}
+    step = MINIMAL | {"search": {"algorithm": "es", "step": {"learning_rate": 0.1}}}
+    assert found(step, "search.step.kind=plain") == {"search.step.learning_rate": (0.1, 0.01)}
+    assert found(step, "search.step.kind=adam") == {}  # what it is without a word
+
+
+def test_values_that_stay_are_named_on_the_command_line(tmp_path, capsys):
+    file, wanted = tmp_path / "my.yaml", ["search.algorithm=map_elites"]
+    file.write_text(dump_yaml(MINIMAL | {"search": {"algorithm": "es", "evaluation_episodes": 30}}))
+    print_config_notes(file, [(wanted, api.load_config(file, wanted))])
+    printed = " ".join("".join(capsys.readouterr()).split())
+    kept_one = f"note: kept search.evaluation_episodes = 30 (by default 1) of {file}, although map_elites replaces its"
+    assert f"{kept_one} algorithm" in printed
+
+
+def test_a_sweep_over_methods_names_the_keys_for_which_they_have_other_defaults(tmp_path):
+    """The values of the config were chosen for one of the methods, which would win such a comparison."""
+    source = MINIMAL | {"search": {"algorithm": "me_es", "evaluation_episodes": 30, "sigma": 0.3}}
+    grid = {"search.algorithm": ["me_es", "map_elites", "es", "nsr_es"]}
+    with pytest.raises(ConfigError) as caught:
+        plan(source, tmp_path, grid, range(2))
+    assert [problem.sentence for problem in caught.value.problems] == [
+        "search.evaluation_episodes: the config has 30 for another search.algorithm, and the default is 1 with "
+        "map_elites; set it for all runs of the sweep, such as search.evaluation_episodes=30",
+        "search.sigma: the config has 0.3 for another search.algorithm, and the default is 0.02 with es and nsr_es; "
+        "set it for all runs of the sweep, such as search.sigma=0.3",
+    ]
+    named = ["search.evaluation_episodes=30"]
+    grid = {"search.algorithm": ["me_es", "map_elites"]}
+    assert [run.config.search.evaluation_episodes for run in plan(source, tmp_path, grid, overrides=named)] == [30, 30]
+    several = grid | {"search.evaluation_episodes": [1, 30]}
+    assert [run.config.search.evaluation_episodes for run in plan(source, tmp_path, several)] == [1, 30, 1, 30]
+    assert plan(source, tmp_path, {"search.algorithm": ["map_elites"]})  # one method: a note says what stays
+    kinds = {"search.step.kind": ["adam", "plain"]}
+    stepping = MINIMAL | {"search": {"algorithm": "es", "step": {"learning_rate": 0.1}}}
+    with pytest.raises(ConfigError, match=r"learning_rate: .* another search\.step\.kind, .* 0\.01 with plain; set"):
+        plan(stepping, tmp_path, kinds)
+    with pytest.raises(ConfigError, match=r"search\.step\.kind: \[plain\] is not allowed"):
+        plan(stepping, tmp_path, {"search.step.kind": [["plain"], "adam"]})
+
+
+def test_a_sweep_over_methods_says_of_each_key_only_one_thing(tmp_path):
+    source = MINIMAL | {"policy": {"observation_normalization": True}}
+    with pytest.raises(ConfigError) as caught:
+        plan(source, tmp_path, {"search.algorithm": ["es", "map_elites", "nope", "no.such:search"]})
+    found = [problem.field for problem in caught.value.problems]
+    assert found == ["policy.observation_normalization", "search.algorithm", "search.algorithm"]
 
 
 def test_a_run_may_be_told_again_what_has_no_effect_but_nothing_else(tmp_path):
