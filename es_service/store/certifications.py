@@ -38,15 +38,12 @@ class CertifiedRow:
     arrays: Mapping[str, NDArray[Any]]
 
 
-def insert(connection: sqlite3.Connection, number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> int:
-    """Store a certification: (facts, arrays) of each policy in the order of rank. Returns the bytes of the arrays."""
-    size = 0
+def insert(connection: sqlite3.Connection, number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> None:
+    """Store a certification: (facts, arrays) of each policy in the order of rank."""
     for rank, (facts, arrays) in enumerate(policies):
         text, payload = json.dumps(facts, sort_keys=True), encode_part(arrays)
         row = (number, rank, text, payload, _sha256(number, rank, text, payload))
         connection.execute("INSERT INTO certification VALUES (?, ?, ?, ?, ?)", row)
-        size += len(payload)
-    return size
 
 
 def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None) -> int:

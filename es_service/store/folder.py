@@ -13,6 +13,8 @@ from es_service.protocol.system import mounts, mounts_of_linux
 
 CONFIG = "config.yaml"
 DATABASE = "run.db"
+LOG = "run.db-wal"
+"""SQLite's write-ahead log beside `run.db`, while a driver writes on a local disk."""
 LOCK = "run.lock"
 COPY = "run.db.copy"
 """Verified copy of `run.db`. It replaces a damaged `run.db`, and readers on a network file system read it."""

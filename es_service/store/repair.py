@@ -19,12 +19,23 @@ from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_d
 from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, Damaged, load_meta, quoted
 from es_service.store.verify import Verdict, verify
 
-_BUSY_S = 10.0
+PATIENCE_S = 10.0
+"""Seconds for which a connection waits for another program that holds the database."""
 
 
 def connect(file: Path) -> sqlite3.Connection:
     """A connection in autocommit mode to an existing or new database; all transactions are explicit."""
-    return sqlite3.connect(file, timeout=_BUSY_S, isolation_level=None)
+    return sqlite3.connect(file, timeout=PATIENCE_S, isolation_level=None)
+
+
+@contextmanager
+def patience(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
+    """Let a connection wait so long for other programs, instead of PATIENCE_S, inside the block."""
+    connection.execute(f"PRAGMA busy_timeout = {round(1000 * seconds)}")
+    try:
+        yield
+    finally:
+        connection.execute(f"PRAGMA busy_timeout = {round(1000 * PATIENCE_S)}")
 
 
 def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Verdict]:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from es_service.errors import StoreError
 from es_service.logs import logger
-from es_service.store.folder import COPY, DATABASE, is_disk_full
-from es_service.store.repair import make_copy
-from es_service.store.schema import Damaged
+from es_service.store.folder import COPY, DATABASE, LOG, is_disk_full
+from es_service.store.repair import make_copy, patience
+from es_service.store.schema import PAGE_BYTES, Damaged
 
 _LOG = logger(__name__)
 LOCAL_COPY_INTERVAL_S = 180.0
@@ -21,11 +21,15 @@ NETWORK_COPY_INTERVAL_S = 10.0
 """Seconds between copies on a network file system, where readers read the copy."""
 COPY_TIME_FRACTION = 0.02
 """Greatest fraction of the time that copying takes; the interval becomes longer if copies take long."""
-CHECKPOINT_BYTES = 8 * 1024 * 1024
-"""Approximate growth of the log, in bytes, after which a commit is followed by a checkpoint."""
+LEAST_LOG_BYTES, MOST_LOG_BYTES = 4 * 2**20, 8 * 2**20
+"""A commit makes a checkpoint once the log is as large as the database; if that is smaller or larger than these sizes,
+with the first or the second of them. Smaller logs
+would make commits slower."""
+HELD_BACK = 4
+"""A reader that keeps more than so many times that size of the log from the database is told."""
 CHECKPOINT_INTERVAL_S = 5.0
 """Seconds after which a commit is followed by a checkpoint in any case. A power cut can lose about this much time."""
-_CLOSE_PATIENCE_MS = 1000
+_CLOSE_PATIENCE_S = 1.0
 
 
 class Upkeep:
@@ -47,7 +51,6 @@ class Upkeep:
         self._copied_at = time.monotonic() - _age_s(folder / COPY, self.copy_interval_s)
         self._copy_seconds = 0.0
         self._is_copied = False
-        self._pending_bytes = 0
         self._checkpointed_at = time.monotonic()
         wanted = "delete" if network else "wal"
         journal = connection.execute(f"PRAGMA journal_mode = {wanted}").fetchone()[0]
@@ -57,8 +60,9 @@ class Upkeep:
         if journal != wanted:  # the run is safe with any other journal as well, but commits take longer
             notices.append(f"{file}: SQLite cannot use a write-ahead log on this disk; its journal is {journal}")
         connection.execute(f"PRAGMA synchronous = {'NORMAL' if journal == 'wal' else 'FULL'}")
-        # This class makes the checkpoints, so that the cost of a commit is known and tests can kill it around them.
-        connection.execute("PRAGMA wal_autocheckpoint = 0")
+        # A log that a reader has held back is cut when it can be used from its beginning again.
+        connection.execute(f"PRAGMA journal_size_limit = {MOST_LOG_BYTES}")
+        self._log_bytes = self._limit_log()
         # Pages of deleted states need not be overwritten with zeros before they are used again.
         connection.execute("PRAGMA secure_delete = OFF")
         # This empty transaction fails at once if the file cannot be written. Moreover, after a quick_check, SQLite
@@ -68,15 +72,18 @@ class Upkeep:
         if network and not (folder / COPY).exists():
             self._copy()
 
-    def after_commit(self, log_bytes: int) -> None:
-        """Make a checkpoint and a copy if they are due, after a commit that added about `log_bytes` to the log."""
+    def after_commit(self) -> None:
+        """Make a checkpoint and a copy if they are due, after a commit."""
         self._is_copied = False
-        self._pending_bytes += log_bytes
         now = time.monotonic()
-        due = self._pending_bytes >= CHECKPOINT_BYTES or now - self._checkpointed_at >= CHECKPOINT_INTERVAL_S
-        if due and not self._network:
+        if now - self._checkpointed_at >= CHECKPOINT_INTERVAL_S and not self._network:
             try:
-                self._checkpoint("PASSIVE")
+                if self._checkpoint("PASSIVE") >= HELD_BACK * self._log_bytes:
+                    self._tell(
+                        f"a program reads {DATABASE} without a pause, so that SQLite cannot empty {LOG} beside it, "
+                        "which grows with each generation; close that program"
+                    )
+                self._log_bytes = self._limit_log()
             except sqlite3.Error as error:
                 self._notice(f"could not move the newest generations from SQLite's log into {DATABASE}", error)
         if now - self._copied_at >= max(self.copy_interval_s, self._copy_seconds / COPY_TIME_FRACTION):
@@ -86,18 +93,27 @@ class Upkeep:
         """Make the database a single file; SQLite's log remains beside it if a reader uses it or the disk is full."""
         if self._network and not self._is_copied:
             self._copy()
-        with contextlib.suppress(sqlite3.Error):
-            self._connection.execute(f"PRAGMA busy_timeout = {_CLOSE_PATIENCE_MS}")
-            self._checkpoint("TRUNCATE")
-        with contextlib.suppress(sqlite3.Error):
-            self._connection.execute("PRAGMA journal_mode = DELETE")
+        with patience(self._connection, _CLOSE_PATIENCE_S):
+            with contextlib.suppress(sqlite3.Error):
+                self._checkpoint("TRUNCATE")
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.execute("PRAGMA journal_mode = DELETE")
 
-    def _checkpoint(self, mode: str) -> None:
+    def _limit_log(self) -> int:
+        """Let SQLite make a checkpoint in each commit after which the log has this size, in bytes."""
+        ((pages,),) = self._connection.execute("PRAGMA page_count")
+        size = min(max(pages * PAGE_BYTES, LEAST_LOG_BYTES), MOST_LOG_BYTES)
+        self._connection.execute(f"PRAGMA wal_autocheckpoint = {size // PAGE_BYTES}")
+        return size
+
+    def _checkpoint(self, mode: str) -> int:
+        """Move the log into the database; returns about how many bytes readers have kept from it."""
         self._hook("before_checkpoint")
         # This comes before a possible failure, so that the next commit does not try again at once.
-        self._checkpointed_at, self._pending_bytes = time.monotonic(), 0
-        self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchall()
+        self._checkpointed_at = time.monotonic()
+        _, pages, moved = self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchone()
         self._hook("after_checkpoint")
+        return (pages - moved) * PAGE_BYTES
 
     def _copy(self) -> None:
         start = time.monotonic()
@@ -112,8 +128,11 @@ class Upkeep:
 
     def _notice(self, what: str, error: Exception) -> None:
         full = not isinstance(error, Damaged) and is_disk_full(error, self._folder)
-        notice = f"{self._folder}: {'disk full: ' if full else ''}{what} ({error})"
-        if notice not in self._notices:
+        self._tell(f"{'disk full: ' if full else ''}{what} ({error})")
+
+    def _tell(self, what: str) -> None:
+        """Add a notice, once in a session."""
+        if (notice := f"{self._folder}: {what}") not in self._notices:
             self._notices.append(notice)
 
 

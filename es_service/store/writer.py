@@ -28,7 +28,7 @@ from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
 from es_service.store.rows import history_rows, insert_history
-from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta
+from es_service.store.schema import Damaged, RunMeta
 from es_service.store.states import KeptStates, insert_state, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
@@ -179,7 +179,7 @@ class RunStore:
         self._kept.commit(new, outdated, total)
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(rows))
-        self.upkeep.after_commit(sum(len(payload) for *_, payload in rows) + 4 * PAGE_BYTES)
+        self.upkeep.after_commit()
 
     def last_history(self) -> dict[str, int | float] | None:
         """History row of the newest generation; NaN stands for no value. None before the first commit."""
@@ -214,8 +214,8 @@ class RunStore:
         StoreError if the database cannot be written."""
         number = self.next_certification
         with self._transaction("storing a certification") as connection:
-            size = certifications.insert(connection, number, policies)
-        self.upkeep.after_commit(size + PAGE_BYTES)
+            certifications.insert(connection, number, policies)
+        self.upkeep.after_commit()
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""

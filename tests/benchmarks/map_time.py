@@ -31,6 +31,7 @@ from es_service.protocol.messages import EpisodesResult, GradientChunk, Gradient
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.maps.behaviour_map import Elite
 from es_service.search.observation_statistics import no_observations
+from es_service.store import writer
 from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
@@ -123,8 +124,14 @@ def measure(place: Path, *case: Any) -> dict[str, Any]:
     started = time.perf_counter()
     with RunStore.open(place) as store:
         opened_s = time.perf_counter() - started
-        upkeep = store.upkeep.after_commit
-        store.upkeep.after_commit = lambda log_bytes: (sizes.append(log_bytes), upkeep(log_bytes))[1]
+        encode = writer.encode_changes
+
+        def encode_changes(generation: int, parts: Any) -> list[Any]:
+            encoded = encode(generation, parts)
+            sizes.append(sum(len(payload) for *_, payload in encoded))
+            return encoded
+
+        writer.encode_changes = encode_changes
         driver.run(search, invented, store, driver.stored_state(store, search.task), rows.append)
     driver_ms, store_ms = (
         round(float(np.median([row[f"seconds_{part}"] for row in rows[5:]])) * 1e3, 2) for part in ("driver", "store")

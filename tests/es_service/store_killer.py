@@ -58,7 +58,7 @@ def main():
             if job == "network":
                 store.is_network_filesystem = lambda path: True
             if job in ("hook", "network"):
-                store_upkeep.CHECKPOINT_BYTES = 50_000
+                store_upkeep.CHECKPOINT_INTERVAL_S = 0.0
                 store_upkeep.NETWORK_COPY_INTERVAL_S = 0.0
                 store_upkeep.COPY_TIME_FRACTION = math.inf
                 with create(folder, hook=killed_at(instant, int(count))) as run:

@@ -13,6 +13,7 @@ from es_service.loop.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
 from es_service.store.beginning import Beginning
+from es_service.store.connection import reading
 from es_service.store.reader import (
     read_evaluations,
     read_generation,
@@ -32,6 +33,7 @@ from tests.es_service.store_examples import (
     assert_same_state,
     create,
     evaluated,
+    evaluated_table,
     finished,
     history_row,
     meta,
@@ -204,7 +206,7 @@ def test_the_file_does_not_grow_with_the_states_it_has_seen(tmp_path):
 
 
 def test_hooks_are_called_in_order(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_upkeep, "CHECKPOINT_BYTES", 0)
+    monkeypatch.setattr(store_upkeep, "CHECKPOINT_INTERVAL_S", 0.0)
     called = []
     with create(tmp_path / "run", generations=1, hook=called.append):
         pass
@@ -216,17 +218,44 @@ def test_hooks_are_called_in_order(tmp_path, monkeypatch):
     assert called == ["opened", *checkpoint]
 
 
-def test_the_log_is_emptied_by_bytes_and_by_time(tmp_path, monkeypatch):
+def test_the_log_is_emptied_after_some_time(tmp_path, monkeypatch):
     called = []
     with create(tmp_path / "run", generations=3, hook=called.append) as run:
         assert "before_checkpoint" not in called
-        with monkeypatch.context() as patch:
-            patch.setattr(store_upkeep, "CHECKPOINT_INTERVAL_S", 0.0)
-            advance(run, 3)
+        monkeypatch.setattr(store_upkeep, "CHECKPOINT_INTERVAL_S", 0.0)
+        advance(run, 3)
         assert called.count("after_checkpoint") == 1
-        monkeypatch.setattr(store_upkeep, "CHECKPOINT_BYTES", 5 * 8192)
-        advance(run, 5)
-        assert called.count("after_checkpoint") == 2
+
+
+def test_the_log_of_a_small_run_stays_small(tmp_path):
+    """Whatever its generations change: a whole centre, or many elites of a page and a half each."""
+    for name, count, values in (("a centre", 1, 100_000), ("elites", 60, 3_000)):
+        elites = {f"elite_{index}": {"x": np.zeros(values, np.float32)} for index in range(count)}
+        folder, largest = tmp_path / name, 0
+        with create(folder) as run:
+            for generation in range(40):
+                run.commit(generation, elites, history_row(generation), evaluated_table(generation))
+                largest = max(largest, (folder / "run.db-wal").stat().st_size)
+        a_generation = 1.5 * sum(part["x"].nbytes for part in elites.values())
+        assert largest < store_upkeep.LEAST_LOG_BYTES + a_generation, name
+
+
+def test_a_log_that_a_reader_holds_back_is_told_once_and_cut_afterwards(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_upkeep, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(store_upkeep, "LEAST_LOG_BYTES", 2**16)
+    monkeypatch.setattr(store_upkeep, "MOST_LOG_BYTES", 2**16)
+    folder = tmp_path / "run"
+    with create(folder, generations=3) as run:
+        with reading(folder) as (connection, _):
+            connection.execute("SELECT count(*) FROM history").fetchone()
+            advance(run, 40)
+            assert (folder / "run.db-wal").stat().st_size > 4 * 2**16
+        assert [notice.partition(",")[0] for notice in run.notices] == [
+            f"{folder}: a program reads run.db without a pause"
+        ]
+        advance(run, 45)
+        assert (folder / "run.db-wal").stat().st_size <= 2**16
+        assert len(run.notices) == 1
 
 
 def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):

@@ -46,8 +46,7 @@ def killed(tmp_path, jobs):
     return {name for name, end in ends.items() if end == "killed"}
 
 
-# With 50,000 bytes a checkpoint follows generation 0 and every second one after it, give or take; what is committed
-# does not depend on that.
+# A checkpoint follows each generation.
 KILLS = [
     *(("opened", count, -1) for count in (1,)),
     *((hook, count, count - 2) for hook in ("before_begin", "mid_transaction", "before_commit") for count in (1, 2, 5)),

@@ -89,7 +89,7 @@ def test_a_write_ahead_log_that_stays_on_a_network_is_refused(tmp_path, monkeypa
 
 
 def test_a_reader_that_holds_on_does_not_fail_the_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_upkeep, "_CLOSE_PATIENCE_MS", 50)
+    monkeypatch.setattr(store_upkeep, "_CLOSE_PATIENCE_S", 0.05)
     folder = tmp_path / "run"
     run = create(folder, generations=3)
     with store_connection.reading(folder) as (connection, _):
