@@ -32,6 +32,8 @@ def task_findings(name: str) -> Iterator[Finding]:
         for dimension, pair in bounds
     ]
     yield "ok", f"its descriptor is {', '.join(shown)}"
+    for note in task.notes:
+        yield "note", note
     if task.kind == "jax":
         yield "ok", "its steps are pure functions that JAX traces, so they repeat; `bench rollouts` measures them"
         return

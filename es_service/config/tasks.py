@@ -150,6 +150,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
             "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
+            "notes": tuple(fields.get("notes", ())),
             "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
             "parameters": None
             if fields.get("parameters") is None

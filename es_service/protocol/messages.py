@@ -88,6 +88,8 @@ class TaskSpec:
     does_not_repeat: str = ""
     """Where a task of Python objects was found to return other numbers for the same seed and actions, in words, such as
     `after another episode`; empty if it was not found to, or was not tried."""
+    notes: tuple[str, ...] = ()
+    """What its author probably did not intend, such as an attribute with an unknown name, in sentences."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:

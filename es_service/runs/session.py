@@ -114,6 +114,8 @@ def work(
             on_compile(sentence)
 
     tell_notices()
+    for note in task.notes if store.generation is None else ():
+        tell(note)
     if store.generation is None and task.does_not_repeat:
         tell(
             f"{task.name} does not repeat itself: with the same seed and actions it returns other numbers "

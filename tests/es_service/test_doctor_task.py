@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 
+import jax.numpy as jnp
 import pytest
 
+from es_service import api
 from es_service.cli.doctor import print_findings
 from es_service.cli.doctor_task import task_findings
 from es_service.errors import ConfigError
+from es_service.protocol.noise import uniforms
 
 MODULE = "tests.workers.host_tasks"
 
@@ -29,6 +32,45 @@ def test_a_task_that_repeats_is_said_to(name, unit, monkeypatch):
     assert repeats.startswith("it repeats bit for bit")
     assert "in another process" in repeats
     assert re.match(rf"[\d,]+ {unit}/s on one core", speed)
+
+
+class Misnamed:
+    """a point stays where it is, and its walls have another name"""
+
+    observation_size = action_size = 1
+    episode_steps = 3
+    descriptor_names, descriptor_bounds = ("x",), ((0.0, 1.0),)
+    wals = (((0.0, 0.0), (1.0, 0.0)),)
+
+    def reset(self, key):
+        return uniforms(key, jnp.zeros(1, jnp.uint32))
+
+    def observe(self, state):
+        return state
+
+    def step(self, state, action):
+        return state, state[0], False
+
+    def descriptor(self, state):
+        return state
+
+
+@pytest.mark.slow
+def test_what_has_no_effect_is_noted_and_a_run_notes_it_once(tmp_path, one_process):
+    name, notices = f"{__name__}:Misnamed", []
+    (note,) = (sentence for level, sentence in findings(name) if level == "note")
+    assert note.startswith(f"{name}: wals has no effect")
+    settings = {
+        "task": {"environment": name},
+        "policy": {"hidden": []},
+        "search": {"algorithm": "es", "pairs": 4, "evaluation_episodes": 1},
+        "budget": {"generations": 1},
+        "compute": {"engine": "inline", "workers": 1, "rollout": "xla"},
+    }
+    folder = api.run(settings, tmp_path / "run", on_notice=notices.append).run.folder
+    assert notices == [note]
+    api.resume(folder, {"budget.generations": 2}, on_notice=notices.append)
+    assert notices == [note]
 
 
 @pytest.mark.slow

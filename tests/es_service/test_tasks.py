@@ -18,6 +18,7 @@ from es_service.protocol.messages import TrainingChunk, with_subject
 from es_service.protocol.noise import uniforms
 from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
+from tests.examples.beam import beam
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment
 from workers.host.repeats import does_not_repeat
@@ -152,11 +153,22 @@ class Widened(Still):
         return state[:2]
 
 
-class Counting:
-    """an option lets it count its episodes"""
+class Plain:
+    """a task of Python objects"""
 
     observation_size = action_size = 1
     episode_steps = 3
+
+    def reset(self, seed):
+        return np.zeros(1)
+
+    def step(self, action):
+        return np.zeros(1), 0.0, False
+
+
+class Counting(Plain):
+    """an option lets it count its episodes"""
+
     options = {"counts": (False, True)}  # noqa: RUF012
 
     def __init__(self, counts=False):
@@ -166,8 +178,88 @@ class Counting:
         self.episodes += self.counts
         return np.full(1, self.episodes)
 
-    def step(self, action):
-        return np.zeros(1), 0.0, False
+
+class Named(Still):
+    """attributes and methods with names of its own"""
+
+    def reset(self, key):
+        return uniforms(key, jnp.arange(2, dtype=jnp.uint32))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [
+        (
+            "discrete_actions",
+            True,
+            r"discrete_actions = True has no effect on a task in JAX: .* policy.output to argmax",
+        ),
+        (
+            "action_bounds",
+            (0.0, 1.0),
+            r"action_bounds = \(0.0, 1.0\) has no effect on a task in JAX: .* clip and scale",
+        ),
+    ],
+)
+def test_what_only_tasks_of_python_objects_declare_is_refused_in_jax(name, value, found, monkeypatch):
+    monkeypatch.setattr(Named, name, value, raising=False)
+    with pytest.raises(TaskError, match=rf"{HERE}:Named: {found}"):
+        describe_environment(f"{HERE}:Named")
+    monkeypatch.setattr(Named, name, False if value is True else None)
+    assert describe_environment(f"{HERE}:Named").notes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("wals", "walls"),
+        ("Goal", "goal"),
+        ("goalDistance", "goal_distance"),
+        ("succes", "success"),
+        ("final_fitnes", "final_fitness"),
+        ("leats_reward", "least_reward"),
+        ("option", "options"),
+        ("action_space", "action_size"),
+        ("max_episode_steps", "episode_steps"),
+    ],
+)
+def test_a_name_that_is_nearly_that_of_an_attribute_is_noted(name, meant, monkeypatch):
+    for task, kind in ((f"{HERE}:Named", Named), (f"python:{HERE}:Plain", Plain)):
+        monkeypatch.setattr(kind, name, 1, raising=False)
+        (note,) = describe_environment(task).notes
+        assert note.startswith(f"{task}: {name} has no effect, ")
+        assert f"did you mean {meant}?" in note
+
+
+def test_beside_the_attribute_itself_a_similar_name_is_its_author_s_own(monkeypatch):
+    monkeypatch.setattr(Named, "goals", ((0.0, 1.0), (1.0, 1.0)), raising=False)
+    assert "did you mean goal?" in describe_environment(f"{HERE}:Named").notes[0]
+    monkeypatch.setattr(Named, "goal", (0.0, 1.0), raising=False)
+    assert describe_environment(f"{HERE}:Named").notes == ()
+
+
+def test_names_of_its_own_are_nobody_s_business(monkeypatch):
+    own = ("_wals", "goal_x", "moves", "wall_height", "reward", "rewards", "distance_to_goal", "best_reward", "is_done",
+           "final_state", "observation", "actions", "metadata", "render_mode", "spec", "rng", "render")  # fmt: skip
+    for name in own:
+        monkeypatch.setattr(Named, name, 1, raising=False)
+        monkeypatch.setattr(Plain, name, lambda self: 1, raising=False)
+    assert describe_environment(f"{HERE}:Named").notes == describe_environment(f"python:{HERE}:Plain").notes == ()
+
+
+def test_a_misspelt_attribute_that_a_class_needs_is_named_where_it_is_missing(monkeypatch):
+    monkeypatch.delattr(Still, "descriptor_names")
+    monkeypatch.setattr(Still, "descriptor_name", ("x", "y"), raising=False)
+    with pytest.raises(TaskError, match=r"Named has no descriptor_names \(but descriptor_name\); workers/environments"):
+        describe_environment(f"{HERE}:Named")
+
+
+def test_a_misspelt_attribute_of_a_function_is_noted(monkeypatch):
+    name = "function:tests.examples.beam:beam"
+    assert describe_environment(name).notes == ()
+    monkeypatch.setattr(beam, "starts", (1.0, 1.0, 0.01), raising=False)
+    (note,) = describe_environment(name).notes
+    assert "did you mean start?" in note
 
 
 @pytest.mark.slow

@@ -6,6 +6,8 @@ Tasks in JAX and tasks of Python objects share this; nothing here imports JAX.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
+from difflib import get_close_matches
 from typing import Any
 
 from es_service.protocol.messages import Bounds, TaskKind, TaskSpec
@@ -57,6 +59,49 @@ def import_named(path: str, what: str = "class") -> Any:
     if not hasattr(imported, name):
         raise TaskError(f"{path}: the module {module} has no {what} {name}")
     return getattr(imported, name)
+
+
+OF_EVERY_CLASS = ("final_fitness", "options", "walls", "wall_clearance", "goal", "least_reward", "goal_distance",
+                  "success")  # fmt: skip
+"""What a class of any kind may declare, as attributes or methods."""
+NEAR = 0.88
+"""Similarity (of `difflib`) of names of which one is taken for a misspelling of the other: a letter of nine."""
+OF_GYMNASIUM = {
+    "observation_space": "observation_size",
+    "action_space": "action_size",
+    "max_episode_steps": "episode_steps",
+}
+"""Attribute of environments of Gymnasium that has no effect here -> what a class declares instead."""
+
+
+def unknown_attributes(path: str, task: Any, known: Collection[str]) -> tuple[str, ...]:
+    """Sentences on attributes and methods that have no effect because of their names.
+
+    Only names that are nearly those of something that the class could have and has not, and those of Gymnasium: all
+    others are the author's own, and so is every name that begins with `_`.
+
+    Args:
+        path: name of the task.
+        known: what a class of this kind may have.
+    """
+    open_names = [name for name in known if not hasattr(task, name)]
+    own = [name for name in dir(task) if not name.startswith("_") and name not in known]
+    meant = {name: near for name in own for near in get_close_matches(name.lower(), open_names, 1, NEAR)}
+    meant |= {name: instead for name, instead in OF_GYMNASIUM.items() if name in own}
+    return tuple(
+        f"{path}: {name} has no effect, since a task declares nothing of this name; did you mean {instead}? (Begin the "
+        "names of your own attributes with _, if this note is to be left out.)"
+        for name, instead in meant.items()
+    )
+
+
+def missing_names(task: Any, needed: Collection[str], help_text: str) -> str:
+    """What a class lacks, in words: " has no X; HELP" with the attributes that may be meant; empty if nothing."""
+    missing = [name for name in needed if not hasattr(task, name)]
+    own = {name.lower(): name for name in dir(task) if not name.startswith("_")}
+    near = [own[other] for name in missing for other in get_close_matches(name, own.keys() - {*needed}, 1, NEAR)]
+    meant = f" (but {', '.join(near)})" if near else ""
+    return f" has no {', '.join(missing)}{meant}; {help_text}" if missing else ""
 
 
 def wrong_values(task: Any, names: Any, bounds: Any, sizes: tuple[str, ...]) -> list[str]:

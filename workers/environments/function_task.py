@@ -37,13 +37,14 @@ from es_service.protocol.messages import Bounds, FloatArray, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options
 from es_service.protocol.parameters import FREE, ParameterSpec
 from workers.environments import TaskError
-from workers.environments.declared import are_finite, clashes, import_named, wrong_pairs
+from workers.environments.declared import are_finite, clashes, import_named, unknown_attributes, wrong_pairs
 from workers.environments.host_descriptors import finite_bounds
 
 PREFIX = "function:"
 SHOWN = 2
 """Parameters that are the descriptor of a function without one."""
 DESCRIPTOR = ("descriptor_names", "descriptor_bounds")
+KNOWN = ("parameters", "start", *DESCRIPTOR, "deterministic", "least_fitness", "options")
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ def describe(path: str) -> TaskSpec:
         kind="function",
         parameters=parameters,
         deterministic=bool(getattr(function, "deterministic", False)),
+        notes=unknown_attributes(name, function, KNOWN),
     )
 
 

@@ -36,7 +36,16 @@ from typing import Any
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
 from workers.environments import TaskError
-from workers.environments.declared import are_finite, import_named, task_of_class, wrong_pairs, wrong_values
+from workers.environments.declared import (
+    OF_EVERY_CLASS,
+    are_finite,
+    import_named,
+    missing_names,
+    task_of_class,
+    unknown_attributes,
+    wrong_pairs,
+    wrong_values,
+)
 from workers.environments.host_descriptors import describe_descriptor
 from workers.environments.host_task import (
     IS_SUCCESS,
@@ -54,6 +63,7 @@ from workers.environments.host_task import (
 SIZES = ("observation_size", "action_size", "episode_steps")
 METHODS = ("reset", "step")
 DESCRIPTOR = ("descriptor_names", "descriptor_bounds")
+KNOWN = (*SIZES, *METHODS, *DESCRIPTOR, *OF_EVERY_CLASS, "descriptor", "action_bounds", "discrete_actions")
 KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", "walls", "wall_clearance", "goal", "least_reward",
         "final_fitness")  # fmt: skip
 """Attributes that a constructor must not change, since a run takes them from the class."""
@@ -74,10 +84,9 @@ def describe(
     """
     task, name = import_named(path), PREFIX + path
     needed = (*SIZES, *METHODS, *(DESCRIPTOR if hasattr(task, "descriptor") else ()))
-    if missing := [attribute for attribute in needed if not hasattr(task, attribute)]:
-        raise TaskError(
-            f"{name} has no {', '.join(missing)}; workers/environments/python_task.py lists what such a task must have"
-        )
+    lists = "workers/environments/python_task.py lists what such a task must have"
+    if missing := missing_names(task, needed, lists):
+        raise TaskError(f"{name}{missing}")
     wrong = [
         f"{attribute} = {getattr(task, attribute)!r} is not of type int"
         for attribute in SIZES
@@ -104,7 +113,8 @@ def describe(
         no_bounds = [(-math.inf, math.inf)] * task.observation_size
         names, bounds = describe_descriptor(made, descriptor, no_bounds, task.action_size)
         spec = replace(spec, descriptor_names=names, descriptor_bounds=bounds)
-    return replace(spec, discrete_actions=bool(getattr(task, "discrete_actions", False)))
+    notes = unknown_attributes(name, task, KNOWN)
+    return replace(spec, discrete_actions=bool(getattr(task, "discrete_actions", False)), notes=notes)
 
 
 def descriptor_of(task: Any) -> tuple[Any, Any]:

@@ -41,6 +41,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -51,7 +52,14 @@ from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
 from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError
-from workers.environments.declared import import_named, task_of_class, wrong_values
+from workers.environments.declared import (
+    OF_EVERY_CLASS,
+    import_named,
+    missing_names,
+    task_of_class,
+    unknown_attributes,
+    wrong_values,
+)
 
 METHODS = ("reset", "observe", "step", "descriptor")
 ATTRIBUTES = {
@@ -61,6 +69,15 @@ ATTRIBUTES = {
     "descriptor_names": tuple,
     "descriptor_bounds": tuple,
 }
+
+KNOWN = (*ATTRIBUTES, *METHODS, *OF_EVERY_CLASS, "viewer")
+OF_PYTHON_TASKS = {
+    "discrete_actions": "set policy.output to argmax, with which the action is 1 for the chosen one and 0 for the "
+    "others (action @ moves)",
+    "action_bounds": "step gets what the policy puts out; clip and scale it there, such as by "
+    "low + (high - low) * (jnp.clip(action, -1.0, 1.0) + 1.0) / 2.0",
+}
+"""Attribute that only tasks of Python objects have -> what a task in JAX does instead."""
 
 JAX_KEY_WANTED = (
     "reset(key) passes its key to jax.random, but it is a stream key of es-service, uint32 [4]. Make random numbers "
@@ -78,15 +95,18 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
         TaskError: the class cannot be imported, or its attributes or methods are missing or wrong.
     """
     task = import_named(path)
-    missing = [name for name in (*ATTRIBUTES, *METHODS) if not hasattr(task, name)]
-    if missing:
-        raise TaskError(
-            f"{path} has no {', '.join(missing)}; workers/environments/user_task.py lists what a task must have"
-        )
+    lists = "workers/environments/user_task.py lists what a task must have"
+    if missing := missing_names(task, (*ATTRIBUTES, *METHODS), lists):
+        raise TaskError(f"{path}{missing}")
     wrong = [
         f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
         for name, type_ in ATTRIBUTES.items()
         if not isinstance(getattr(task, name), type_)
+    ]
+    wrong += [
+        f"{name} = {value!r} has no effect on a task in JAX: {instead}, and remove the attribute"
+        for name, instead in OF_PYTHON_TASKS.items()
+        if (value := getattr(task, name, None)) is not None and value is not False
     ]
     options, wrong_options = declared_options(task)
     wrong += wrong_options
@@ -96,7 +116,8 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
     _check_shapes(path, option_values(options, given))
-    return task_of_class(path, task, "jax", (task.descriptor_names, task.descriptor_bounds), options)
+    spec = task_of_class(path, task, "jax", (task.descriptor_names, task.descriptor_bounds), options)
+    return replace(spec, notes=unknown_attributes(path, task, KNOWN))
 
 
 def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:

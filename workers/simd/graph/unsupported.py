@@ -9,7 +9,10 @@ _UNIFORMS = (
     "make random numbers by es_service.protocol.noise.uniforms(key, counters), with the key of reset and a counter in "
     "the state"
 )
-_ONE_HOT = "instead of array[index] write jax.nn.one_hot(index, len(array)) @ array"
+_ONE_HOT = (
+    "instead of array[index] write jax.nn.one_hot(index, len(array)) @ array, or with policy.output = argmax, whose "
+    "action is such a vector, action @ array"
+)
 _UPDATE = "instead of array.at[index].set(x) write jnp.where(jnp.arange(len(array)) == index, x, array)"
 _FORMULA = "write small systems out, or solve them by a fixed number of iterations"
 WAYS_ROUND = {
