@@ -365,6 +365,12 @@ def test_actions_to_choose_from_are_numbers_and_a_task_without_a_descriptor_has_
         assert (found.descriptor == 5.0).all()
 
 
+RESET = r"reset\(seed\) must start an episode that depends only on the seed, and return an observation of 3 numbers, or"
+STEP = (
+    r"step\(action\) must do one step, and return \(observation, reward, done\), or \(observation, reward, terminated"
+)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "problem"),
     [
@@ -376,9 +382,48 @@ def test_actions_to_choose_from_are_numbers_and_a_task_without_a_descriptor_has_
         ("discrete_actions", True, "action_bounds = .* has no meaning with discrete_actions"),
         ("descriptor_bounds", ((0.0, 1.0),) * 2, "1 descriptor_names but 2 descriptor_bounds"),
         ("descriptor", lambda self: [1.0, 2.0], "the descriptor has 2 numbers, not 1"),
-        ("step", lambda self, action: (0.0, 1.0), r"step returned 2 values; it must return \(observation, reward"),
+        ("step", lambda self, action: (0.0, 1.0), rf"step returned 2 values; {STEP}"),
+        ("step", lambda self: ([0.0] * 3, 1.0, False), rf"step takes \(\) and not an action; {STEP}"),
+        ("step", lambda self, action: None, rf"step returned None \(is a `return` missing\?\); {STEP}"),
+        (
+            "step",
+            lambda self, action: ([0.0] * 3, 1.0, np.array([False, True])),
+            rf"done = array\(.*not one bool; {STEP}",
+        ),
+        (
+            "step",
+            lambda self, action: ([0.0] * 3, 1.0, False, None, {}),
+            rf"truncated = None .*, which is not one.*{STEP}",
+        ),
+        ("step", lambda self, action: (None, 1.0, False), rf"step returned the observation None .*; {STEP}"),
+        ("reset", lambda self: [0.0] * 3, rf"reset takes \(\) and not an argument named seed; {RESET}"),
+        ("reset", lambda self, rng_seed: [0.0] * 3, rf"reset takes \(rng_seed\) and not an argument.*; {RESET}"),
+        (
+            "reset",
+            lambda self, seed: None,
+            rf"reset returned the observation None \(is a `return` missing\?\); {RESET}",
+        ),
+        (
+            "reset",
+            lambda self, seed: [np.zeros(1), np.zeros(2)],
+            rf"reset returned the observation \[array.*\]; {RESET}",
+        ),
+        ("reset", lambda self, seed: {"angle": 0.0}, rf"reset returned the observation {{'angle': 0.0}}; {RESET}"),
+        (
+            "reset",
+            lambda self, seed: np.full(99, "x"),
+            rf"reset returned the observation array\(.{{80,90}} \.\.\.; {RESET}",
+        ),
+        ("descriptor", lambda self: None, r"the descriptor is None \(is a `return` missing\?\); it must be 1 numbers"),
+        (
+            "goal_distance",
+            lambda self: None,
+            r"goal_distance is None \(is a `return` missing\?\); it must be 1 numbers",
+        ),
+        ("goal_distance", lambda self: [0.0, 1.0], "goal_distance has 2 numbers, not 1"),
+        ("success", lambda self: None, r"success is None \(is a `return` missing\?\); it must be one bool"),
         ("step", lambda self, action: 1 / 0, "cannot do a step: ZeroDivisionError"),
-        ("step", None, "cannot do a step"),
+        ("step", None, f"step is no method, but None; {STEP}"),
         ("step", lambda self, action: ([0.0] * 3, 1.0, False, False, None), "step returned the info None; it must be"),
         ("reset", lambda self, seed: ([0.0] * 3, None), "reset returned the info None; it must be a mapping"),
         ("options", {"wind": 3}, "option 'wind' = 3 is neither an Option nor a tuple"),
@@ -386,8 +431,17 @@ def test_actions_to_choose_from_are_numbers_and_a_task_without_a_descriptor_has_
 )
 def test_a_class_that_contradicts_itself_is_refused(name, value, problem, monkeypatch):
     monkeypatch.setattr(host_tasks.Drift, name, value, raising=False)
-    with pytest.raises(TaskError, match=rf"^{DRIFT}.*{problem}"):
+    with pytest.raises(TaskError, match=rf"^{DRIFT}.*{problem}") as caught:
         describe_environment(DRIFT)
+    assert "host_task.py" not in str(caught.value)
+
+
+def test_one_end_may_be_a_bool_or_a_number_of_any_library(monkeypatch):
+    for end in (True, np.True_, 1, np.array(True), np.array([1.0])):
+        monkeypatch.setattr(host_tasks.Drift, "step", lambda self, action, end=end: ([0.0] * 3, 1.0, end))
+        environment = HostEnvironment(make_host_task(DRIFT, {}))
+        environment.reset(0)
+        assert environment.step(0.0)[2] is True, end
 
 
 class Aliased(host_tasks.Drift):

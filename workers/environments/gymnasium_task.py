@@ -154,7 +154,7 @@ def _is(space: Any, kind: str) -> bool:
 def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:
     """(size of an observation, function from an observation to numbers)."""
     if _is(space, "Box"):
-        return _size(task, "observations", space), np.asarray
+        return _size(task, "observations", space), lambda observation: observation
     if _is(space, "Discrete"):
         values = np.arange(space.n) + space.start
         return int(space.n), lambda observation: values == observation

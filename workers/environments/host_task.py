@@ -6,10 +6,13 @@ seed and the actions as far as the object keeps nothing from one episode to the 
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -57,7 +60,7 @@ class HostTask:
     observation, and (observation, reward, done)."""
     observation_size: int
     flat: Callable[[Any], Any]
-    """Function from an observation of the object to numbers, in any shape."""
+    """Function from an observation of the object to numbers, in any shape; what is no numbers stays that."""
     actions: Callable[[FloatArray], Any]
     """Function from actions of a policy [L, A] to a sequence [L] of actions of the object."""
     descriptor_size: int
@@ -71,11 +74,25 @@ class HostTask:
     """Whether `HostEpisode` has all observations and rewards."""
 
 
+CONTRACTS = {
+    "reset": "reset(seed) must start an episode that depends only on the seed, and return an observation of {} "
+    "numbers, or (observation, info)",
+    "step": "step(action) must do one step, and return (observation, reward, done), or (observation, reward, "
+    "terminated, truncated, info)",
+}
+"""Method -> what it must take and return, in words; {} is the size of an observation."""
+
+
 class HostEnvironment:
-    """A Python object as an environment: one episode after another, with observations as flat arrays."""
+    """A Python object as an environment: one episode after another, with observations as flat arrays.
+
+    Its methods raise what the object raises, and TaskError if the object's methods take or return something else.
+    """
 
     def __init__(self, task: HostTask) -> None:
         self._task, self._object = task, task.make()
+        self._require_arguments("reset", "an argument named seed", seed=0)
+        self._require_arguments("step", "an action", 0)
         self._episode = HostEpisode(self._object, np.zeros(0, np.float32))
 
     def reset(self, seed: int) -> FloatArray:
@@ -83,7 +100,7 @@ class HostEnvironment:
         result = self._object.reset(seed=seed)
         observation, info = result if _is_pair(result) else (result, {})
         self._require_info("reset", info)
-        self._episode = HostEpisode(self._object, self._observed(observation), info, dict(info))
+        self._episode = HostEpisode(self._object, self._observed("reset", observation), info, dict(info))
         if self._task.keeps_all:
             self._episode.observations.append(self._episode.observation_O)
         return self._episode.observation_O
@@ -92,24 +109,27 @@ class HostEnvironment:
         """Do one step: (observation [O], reward, whether the episode has ended)."""
         result = self._object.step(action)
         if not isinstance(result, tuple | list) or len(result) not in (3, 5):
-            returned = f"{len(result)} values" if isinstance(result, tuple | list) else repr(result)
-            raise TaskError(
-                f"{self._task.name}: step returned {returned}; it must return (observation, reward, done), or "
-                "(observation, reward, terminated, truncated, info)"
-            )
+            returned = f"{len(result)} values" if isinstance(result, tuple | list) else _shown(result)
+            raise self._broken("step", f"returned {returned}")
         observation, reward, *ends = result
         try:
             episode, reward = self._episode, float(reward)
         except (TypeError, ValueError):
             raise TaskError(f"{self._task.name}: step returned the reward {reward!r}; it must be a number") from None
-        episode.observation_O, episode.steps = self._observed(observation), episode.steps + 1
+        episode.observation_O, episode.steps = self._observed("step", observation), episode.steps + 1
         episode.info = ends[2] if len(ends) == 3 else {}
         self._require_info("step", episode.info)
         episode.said |= episode.info
         if self._task.keeps_all:
             episode.observations.append(episode.observation_O)
             episode.rewards.append(reward)
-        return episode.observation_O, reward, any(map(bool, ends[:2]))
+        names = ("done",) if len(ends) == 1 else ("terminated", "truncated")
+        has_ended = False
+        for name, end in zip(names, ends, strict=False):
+            if (is_true := _bool(end)) is None:
+                raise self._broken("step", f"returned {name} = {_shown(end)}, which is not one bool")
+            has_ended |= is_true
+        return episode.observation_O, reward, has_ended
 
     @property
     def info(self) -> Mapping[str, Any]:
@@ -118,12 +138,7 @@ class HostEnvironment:
 
     def descriptor(self) -> FloatArray:
         """Descriptor [B] of the episode if it ends now."""
-        found_B = np.array(self._task.descriptor(self._episode), np.float32).reshape(-1)  # a copy, as in `_observed`
-        if found_B.size != self._task.descriptor_size:
-            raise TaskError(
-                f"{self._task.name}: the descriptor has {found_B.size} numbers, not {self._task.descriptor_size}"
-            )
-        return found_B
+        return self._numbers("the descriptor", self._task.descriptor(self._episode), self._task.descriptor_size)
 
     def measured_size(self) -> int:
         """How many numbers the descriptor has, for a task that does not know it yet."""
@@ -131,24 +146,54 @@ class HostEnvironment:
 
     def goal_distance(self) -> float:
         """Present distance to the goal, NaN without one."""
-        return math.nan if self._task.goal_distance is None else float(self._task.goal_distance(self._episode))
+        if self._task.goal_distance is None:
+            return math.nan
+        return self._numbers("goal_distance", self._task.goal_distance(self._episode), 1).item()
 
     def success(self) -> bool:
         """Whether the episode has succeeded if it ends now."""
-        return bool(self._task.success(self._episode))
+        value = self._task.success(self._episode)
+        if (has_succeeded := _bool(value)) is None:
+            raise TaskError(f"{self._task.name}: success is {_shown(value)}; it must be one bool")
+        return has_succeeded
 
     def _require_info(self, method: str, info: Any) -> None:
         if not isinstance(info, Mapping):
             raise TaskError(f"{self._task.name}: {method} returned the info {info!r}; it must be a mapping")
 
-    def _observed(self, observation: Any) -> FloatArray:
-        # A copy, since an object may change the array that it has returned.
-        flat_O = np.array(self._task.flat(observation), np.float32).reshape(-1)
-        if flat_O.size != self._task.observation_size:
-            raise TaskError(
-                f"{self._task.name}: an observation has {flat_O.size} numbers, not {self._task.observation_size}"
-            )
-        return flat_O
+    def _require_arguments(self, method: str, takes: str, *arguments: Any, **named: Any) -> None:
+        called = getattr(self._object, method)
+        if not callable(called):
+            raise self._broken(method, f"is no method, but {called!r}")
+        try:
+            signature = inspect.signature(called)
+        except (TypeError, ValueError):  # some functions in C have none
+            return
+        try:
+            signature.bind(*arguments, **named)
+        except TypeError:
+            raise self._broken(method, f"takes {signature} and not {takes}") from None
+
+    def _broken(self, method: str, what: str) -> TaskError:
+        contract = CONTRACTS[method].format(self._task.observation_size)
+        return TaskError(f"{self._task.name}: {method} {what}; {contract}")
+
+    def _numbers(self, what: str, value: Any, size: int) -> FloatArray:
+        """A value as an array [N]; a copy, since an object may change the array that it has returned."""
+        if (array_N := _array(value)) is None:
+            raise TaskError(f"{self._task.name}: {what} is {_shown(value)}; it must be {size} numbers")
+        return self._of_size(what, array_N, size)
+
+    def _observed(self, method: str, observation: Any) -> FloatArray:
+        flat_O = None if observation is None else _array(self._task.flat(observation))
+        if flat_O is None:
+            raise self._broken(method, f"returned the observation {_shown(observation)}")
+        return self._of_size("an observation", flat_O, self._task.observation_size)
+
+    def _of_size(self, what: str, array_N: FloatArray, size: int) -> FloatArray:
+        if array_N.size != size:
+            raise TaskError(f"{self._task.name}: {what} has {array_N.size} numbers, not {size}")
+        return array_N
 
 
 def length(episode: HostEpisode) -> float:
@@ -217,6 +262,27 @@ def chosen(action_L_A: FloatArray) -> list[int]:
 def unchanged(action_L_A: FloatArray) -> FloatArray:
     """Actions of a policy as they are, in arrays that the object may change."""
     return action_L_A.copy()
+
+
+def _array(value: Any) -> FloatArray | None:
+    """A copy of numbers as an array [N], or None if they are no numbers."""
+    if value is not None:  # which NumPy takes for NaN
+        with suppress(TypeError, ValueError):
+            return np.array(value, np.float32).reshape(-1)
+    return None
+
+
+def _bool(value: Any) -> bool | None:
+    """What one bool or number says, also one in an array; None for anything else."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    array = np.asarray(value)
+    return bool(array.item()) if array.size == 1 and array.dtype.kind in "biuf" else None
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, on one line and not too long."""
+    return "None (is a `return` missing?)" if value is None else shorten(repr(value), 100, placeholder=" ...")
 
 
 def _is_pair(result: Any) -> bool:
