@@ -29,6 +29,7 @@ from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
+from es_service.protocol.parent import require_same_process
 from es_service.runs.checked_config import load_config
 from es_service.runs.session import CallerLeft, OnNotice, Outcome, warn
 from es_service.runs.view import Run, open_run
@@ -120,7 +121,7 @@ class AskTell:
         self._asked: Asked | None = None
         self._error: BaseException | None = None
         """What has ended the run before its budget was spent; raised again by every later call."""
-        self._dimensions = dimensions
+        self._dimensions, self._maker = dimensions, os.getpid()
 
     @property
     def run(self) -> Run:
@@ -130,8 +131,9 @@ class AskTell:
     def ask(self) -> Asked | None:
         """What is to be computed next; the same until it is told; None once the budget is spent.
 
-        Raises what `run` raises, if the run cannot continue.
+        Raises what `run` raises, if the run cannot continue, and ForkedError in a process that was forked.
         """
+        require_same_process(self._maker, "this ask_tell", "have that one tell what is computed here")
         if self._asked is None and self.outcome is None:
             self._receive()
         return self._asked
@@ -300,8 +302,9 @@ def ask_tell(
         yield search
     finally:
         search._asked = None
-        search._to_run.put(None)
-        thread.join()
+        if os.getpid() == search._maker:  # else the run goes on in another process
+            search._to_run.put(None)
+            thread.join()
         if search.outcome is None and search._error is None:  # what the run asked last may still be in the queue
             search._error = EvaluationError(LEFT)
 

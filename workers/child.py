@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import Any
 
-from es_service.protocol.parent import bound, guard_of, start_child
+from es_service.protocol.parent import bound, guard_of, require_same_process, start_child
 from es_service.protocol.raised import raised
 from es_service.protocol.wire import framed, receive
 
@@ -45,11 +45,12 @@ class Child:
             theirs.close()
             guard = guard_of(process)
             unless_started.pop_all()
-        self._process = process
+        self._process, self._maker = process, os.getpid()
         self._end = weakref.finalize(self, _end, os.getpid(), self._socket, process, guard)
 
     def ask(self, *request: Any) -> None:
-        """Send the arguments of one call of the function."""
+        """Send the arguments of one call of the function. Raises ForkedError in a process that was forked."""
+        require_same_process(self._maker, "the child process of a task", "make another task or environment in that one")
         with suppress(OSError):  # it has ended, which `answer` finds
             self._socket.sendall(framed(request))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -32,12 +33,15 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
+from es_service.protocol.parent import require_same_process
 from es_service.protocol.pieces import pieces_of, separated, together, whole
 from es_service.protocol.policies import POLICY_SLOTS
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
 """Events and commands that `logging` reports at level INFO."""
+_OF_ITS_PROCESS = "the session of a run", "end this one: the run goes on in the other"
+"""What a process that was forked during a session is told; see `require_same_process`."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
 
@@ -160,6 +164,7 @@ class Engine(Generic[AnyTransport]):
             on_wait, on_compile: as in `Waits`.
         """
         self.transport = transport
+        self._maker = os.getpid()
         self._should_stop = should_stop
         self._log = log
         self._waits = Waits(on_wait, on_compile)
@@ -210,7 +215,7 @@ class Engine(Generic[AnyTransport]):
 
         Raises:
             EvaluationError: a work item failed in all its attempts, or no worker starts or gets a place.
-            Interrupted: a stop was requested.
+            Interrupted: a stop was requested. ForkedError: this process was forked from that of the engine.
         """
         return self.begin(work)()
 
@@ -219,6 +224,7 @@ class Engine(Generic[AnyTransport]):
 
         Results for which nobody waits are dropped when another evaluation begins, and this waits for them first.
         """
+        require_same_process(self._maker, *_OF_ITS_PROCESS)
         while pending(self._state):
             self._serve()
         while (message := self.transport.receive(0.0)) is not None:
@@ -247,8 +253,12 @@ class Engine(Generic[AnyTransport]):
         return wait
 
     def close(self) -> None:
-        """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards."""
-        self.transport.close()
+        """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards.
+
+        In a process that was forked, the workers go on: they belong to the other one.
+        """
+        if os.getpid() == self._maker:
+            self.transport.close()
 
     def __enter__(self) -> Self:
         return self
@@ -276,6 +286,7 @@ class Engine(Generic[AnyTransport]):
 
     def _serve(self) -> None:
         """Handle the next message, or check the deadlines if none arrives for a short time."""
+        require_same_process(self._maker, *_OF_ITS_PROCESS)
         if (number := self._should_stop()) is not None:
             raise Interrupted(number)
         wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))

@@ -18,6 +18,8 @@ from concurrent.futures import Future
 from functools import cache
 from queue import SimpleQueue
 
+from es_service.protocol.errors import ForkedError
+
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
 _GUARD = ("/bin/sh", "-c", "read -r _; kill -9 0")
@@ -57,6 +59,22 @@ def start_child(start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Pope
     started: Future[subprocess.Popen[bytes]] = Future()
     _starts(os.getpid()).put((start, started))
     return started.result()
+
+
+def require_same_process(maker: int, what: str, instead: str) -> None:
+    """Raise ForkedError in another process than the one that has made something: both have its sockets, so each would
+    read answers that are meant for the other.
+
+    Args:
+        maker: id of the process that has made it.
+        what: what it is, as the subject of a sentence.
+        instead: what to do, in words.
+    """
+    if os.getpid() != maker:
+        raise ForkedError(
+            f"{what} belongs to process {maker} and cannot be used in process {os.getpid()}, which os.fork() or "
+            f"multiprocessing has made of it; {instead}"
+        )
 
 
 def guard_of(child: subprocess.Popen[bytes]) -> subprocess.Popen[bytes]:

@@ -6,6 +6,7 @@ E episodes, D policy parameters, O observation, A action, B descriptor dimension
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from es_service.loop.checks import valid_members
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
+from es_service.protocol.parent import require_same_process
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 
@@ -104,6 +106,7 @@ class PolicyEvaluator:
         """Number of parameters of a policy, D."""
         self._engine = engine
         self._closed = ""
+        self._maker = os.getpid()
         self._in_turn = RLock()  # an error during a call closes the evaluator in its turn
 
     def initial(self, number: int = 0) -> FloatArray:
@@ -137,6 +140,7 @@ class PolicyEvaluator:
         Raises:
             ConfigError: an argument is wrong; `field` names it.
             EvaluationError: the rollouts cannot continue, after which the evaluator is closed; or it is closed.
+            ForkedError: this process was forked from the one that made the evaluator.
         """
         policies_N_D = policies_of(self.config, self.task, parameters)
         statistics = statistics_of(self.task, len(policies_N_D), observation_mean, observation_std)
@@ -147,6 +151,7 @@ class PolicyEvaluator:
             seed=self.config.seed if seed is None else whole("seed", seed, 0),
             generation=whole("generation", generation, 0),
         )
+        require_same_process(self._maker, "this evaluator", "make another one here with es_service.evaluator")
         with self._in_turn:
             if self._closed:
                 raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
@@ -168,7 +173,9 @@ class PolicyEvaluator:
 
     def close(self, why: str = "this evaluator is closed") -> None:
         """End the workers, after the call of another thread if there is one. Later calls, also those that wait, raise
-        an EvaluationError that begins with `why`."""
+        an EvaluationError that begins with `why`. In a process that was forked, the workers go on."""
+        if os.getpid() != self._maker:  # where another thread may have had its turn for ever
+            return
         with self._in_turn:
             if not self._closed:
                 self._closed = why

@@ -9,6 +9,7 @@ synchronous, and readers read the copy. After a clean end, `run.db` is a single 
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.protocol.parent import require_same_process
 from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
@@ -63,6 +65,7 @@ class RunStore:
         self.notices = []
         self.lock = lock
         self._hook = hook
+        self._maker = os.getpid()
         self._closed = self._recorded = False
         with contextlib.ExitStack() as closing:
             closing.callback(lock.release)
@@ -228,7 +231,8 @@ class RunStore:
         If a reader still uses the database or the disk is full, SQLite's log remains beside it, and nothing is lost.
         """
         self._closed = True
-        self._closing.close()
+        if os.getpid() == self._maker:  # else the process that forked this one goes on writing
+            self._closing.close()
 
     def __enter__(self) -> Self:
         return self
@@ -240,6 +244,7 @@ class RunStore:
     def _explaining(self, doing: str) -> Iterator[None]:
         if self._closed:
             raise StoreError(f"{self.folder}: the store was closed before {doing}")
+        require_same_process(self._maker, f"the writer of {self.folder}", "end this one: the run goes on in the other")
         try:
             yield
         except sqlite3.Error as error:

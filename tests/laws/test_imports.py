@@ -30,12 +30,12 @@ LAYERS = (
     "loop",
     "search",
     "config",
-    "protocol",
     "errors",
+    "protocol",
     "logs",
 )
 """From the user's side down."""
-LOWEST = ("protocol", "errors", "logs")
+LOWEST = ("protocol", "logs")
 """Layers that import nothing of the project."""
 ENTRIES = {"es_service.__init__": "asking", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
@@ -59,11 +59,12 @@ RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 """Modules of es_service that import Ray, inside the functions that need it: all others are given the module."""
 OTHER_MEANINGS = {
     "workers.xla_cache": {"xla"},
+    "es_service.asking": {"asked"},
     "es_service.store.lock": {"host"},
     "es_service.runs.run_status": {"host"},
     "es_service.watch.guard": {"host"},
 }
-"""Module -> words that mean a folder or a machine there, and not the rollouts of these names."""
+"""Module -> words that mean a folder, a machine or an argument there, and not the rollouts of these names."""
 
 
 def module_of(path: Path) -> str:

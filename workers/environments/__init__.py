@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, choice
 from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS
@@ -16,10 +17,6 @@ from workers.viewer import Viewer
 if TYPE_CHECKING:  # it imports this module
     from workers.environments.function_task import FunctionTask
     from workers.environments.host_task import HostTask
-
-
-class TaskError(Exception):
-    """A task does not exist or cannot be used; the message says why."""
 
 
 ANT_CLEARANCE = 0.65

@@ -7,6 +7,7 @@ depends on its own state and action alone, and the code of all widths computes t
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
+from es_service.protocol.parent import require_same_process
 from workers.environments import TaskError, make_environment
 from workers.lanes.blocks import Blocks
 from workers.lanes.functions import Seen, lane_functions
@@ -56,6 +58,7 @@ class CompiledLanes:
         together = max(1, ALIGNMENT // (4 * self._width))  # blocks, so that the memory of each thread is aligned
         share = -(-blocks // (threads * together)) * together
         self._shares = [slice(first, first + share) for first in range(0, blocks, share)]
+        self._maker = os.getpid()
         self._pool = ThreadPoolExecutor(len(self._shares)) if len(self._shares) > 1 else None
 
     def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> Seen:
@@ -70,6 +73,7 @@ class CompiledLanes:
         if self._pool is None:
             self._step.run(self._words, self._out)
         else:
+            require_same_process(self._maker, "a vector environment with threads", "make another one in that process")
             list(self._pool.map(lambda of: self._step.run(self._words[of], self._out[of]), self._shares))
         self._words[:, : self._carry_words] = self._out[:, : self._carry_words]
         return _seen(self._step, self._out, self._carry_words, self.lanes)
