@@ -3,8 +3,8 @@
     try:
         resume("runs/a", ["search.sigma=0.3"])
     except ConfigError as error:
-        way = error.way_out                  # WayOut(action="fork", run="runs/a", settings={"search.sigma": 0.3}, ...)
-        fork(way.run, way.settings)
+        if (way := error.way_out) and way.run:  # WayOut("fork", ..., run="runs/a", settings={"search.sigma": 0.3})
+            fork(way.run, way.settings)
 
 `str(error)` ends with the ways out as Python calls; the command line prints the same ones as shell commands. Every
 error can be pickled, for callers that run in the processes of a pool.

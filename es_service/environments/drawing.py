@@ -32,15 +32,20 @@ def require_mode(mode: str | None) -> None:
         )
 
 
+def modes_of(task: TaskSpec) -> list[str]:
+    """Values of `render_mode` beside None: pictures if the descriptor of a task is a place in the plane."""
+    is_place = len(task.descriptor_names) == 2 and (
+        bool(task.walls) or task.goal is not None or task.descriptor_names == ("x", "y")
+    )
+    return list(MODES) if is_place else []
+
+
 class Trails:
     """The ways of the current episodes of N environments, and pictures of them."""
 
     def __init__(self, task: TaskSpec, count: int) -> None:
         """Draw the floor. Raises ValueError if the descriptor of the task is no place in the plane."""
-        is_place = len(task.descriptor_names) == 2 and (
-            bool(task.walls) or task.goal is not None or task.descriptor_names == ("x", "y")
-        )
-        if not is_place:
+        if not modes_of(task):
             named = " ".join(task.descriptor_names)
             raise ValueError(
                 f"render_mode = 'rgb_array' draws a descriptor that is a place (x, y), but that of {task.name} is "

@@ -7,10 +7,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
+from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, modes_of, require_mode
 from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
 from workers.lanes import Lanes, LanesState, Seen
@@ -45,6 +45,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self._lanes = Lanes(task, task_options or {}, 1, first=index)
         self.task = self._lanes.task
+        self.metadata = {**self.metadata, "render_modes": modes_of(self.task)}
         self.observation_space, self.action_space = observation_space(self.task), action_space(self.task)
         self._trails = None if render_mode is None else Trails(self.task, 1)
         self._is_seeded = self._is_closed = False
@@ -70,7 +71,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return seen.observation[0], self._info(seen)
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Step with an action [A]. Raises ValueError if it has another shape, or before the first reset, and
+        """Step with an action [A]. Raises ValueError if it has another shape, ResetNeeded before the first reset, and
         ClosedEnvironmentError after `close`."""
         self._require_open()
         action_A = np.asarray(action, np.float32)
@@ -88,7 +89,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     def get_state(self) -> LanesState:
         """State of the environment, from which `set_state` of another one of the task goes on, bit for bit. Raises
-        ValueError before the first reset."""
+        ResetNeeded before the first reset."""
         self._require_reset("get_state")
         return self._lanes.state()
 
@@ -112,7 +113,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def _require_reset(self, before: str) -> None:
         self._require_open()
         if not self._is_seeded:
-            raise ValueError(f"call reset before {before}")
+            raise ResetNeeded(f"call reset before {before}")
 
     def _info(self, seen: Seen) -> dict[str, Any]:
         shown = {name: array[0] for name, array in info_of(self.task, seen).items()}

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
+from es_service.environments.drawing import FRAMES_PER_SECOND, Trails, modes_of, require_mode
 from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
 from workers.lanes import Lanes, LanesState, Seen
@@ -77,14 +77,14 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         require_mode(render_mode)
         self.render_mode, self._copies = render_mode, copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {
-            "autoreset_mode": self.autoreset_mode,
-            "render_modes": list(MODES),
-            "render_fps": FRAMES_PER_SECOND,
-        }
         self._lanes = Lanes(task, task_options or {}, num_envs, threads)
         self.num_envs = num_envs
         self.task = self._lanes.task
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode,
+            "render_modes": modes_of(self.task),
+            "render_fps": FRAMES_PER_SECOND,
+        }
         self.max_episode_steps = self.task.episode_steps if max_episode_steps is None else max_episode_steps
         self.single_observation_space, self.single_action_space = observation_space(self.task), action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -122,7 +122,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         """Step every environment with its action [N, A].
 
         Raises:
-            ValueError: the actions have another shape, or an episode is over that the caller has to reset.
+            ValueError: the actions have another shape.
+            ResetNeeded: no episode has begun, or one is over that the caller has to reset.
             ClosedEnvironmentError: the environments are closed.
         """
         self._require_open()
@@ -133,7 +134,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         over_before_N = self._is_over_N
         if self.autoreset_mode == AutoresetMode.DISABLED and over_before_N.any():
             which = np.flatnonzero(over_before_N)
-            raise ValueError(
+            raise ResetNeeded(
                 f"the episode of environment {which[0]} is over; reset it with options={{'reset_mask': ...}}, or "
                 "choose another autoreset_mode"
             )
@@ -163,7 +164,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
 
     def get_state(self) -> State:
         """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit. Raises
-        ValueError before the first reset."""
+        ResetNeeded before the first reset."""
         self._require_reset("get_state")
         return self._lanes.state(), self._is_over_N.copy(), self._observation_N_O.copy()
 
@@ -202,7 +203,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
     def _require_reset(self, before: str) -> None:
         self._require_open()
         if not self._is_seeded_N.all():
-            raise ValueError(f"call reset before {before}")
+            raise ResetNeeded(f"call reset before {before}")
 
     def _begin(self, lane_M: NDArray[np.intp]) -> Seen:
         """Reset some environments; returns what is seen in these."""

@@ -6,10 +6,10 @@ the driver never waits for a tracker, and a tracker that stopped in the middle g
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from es_service.loop.history import Row
 from es_service.runs.session import OnNotice
@@ -27,7 +27,7 @@ Open = Callable[[str, Run], Tracker]
 
 @contextmanager
 def tracked(
-    folder: Path, names: Sequence[str], on_notice: OnNotice, opened: Open = open_tracker
+    folder: str | os.PathLike[str], names: Sequence[str], on_notice: OnNotice, opened: Open = open_tracker
 ) -> Iterator[Callable[[Row], None]]:
     """Context manager around a session of a run, which sends its history to trackers.
 
@@ -71,7 +71,9 @@ def tracked(
                 on_notice(f"the tracker {name} did not finish within {FINISH_S:g} s; {_LATER}")
 
 
-def _follow(folder: Path, name: str, opened: Open, ended: threading.Event, on_notice: OnNotice) -> None:
+def _follow(
+    folder: str | os.PathLike[str], name: str, opened: Open, ended: threading.Event, on_notice: OnNotice
+) -> None:
     """The work of a tracker's thread."""
     try:
         run = open_run(folder)

@@ -15,7 +15,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_match import check_environments_match
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -25,6 +25,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from es_service.environments import drawing
 from es_service.environments.single import TaskEnv
 from es_service.environments.vector import TaskVectorEnv
+from es_service.errors import ServiceError
 from es_service.gymnasium import id_of
 from es_service.protocol.noise import Domain, stream_keys
 from tests.workers.simd.rollouts import targets
@@ -163,6 +164,16 @@ def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_
         check_env(gymnasium.make(id_of(task), render_mode="rgb_array").unwrapped)
 
 
+def test_an_environment_that_cannot_be_drawn_passes_gymnasium_s_check():
+    """Its descriptor is no place, so it has no mode of drawing that the check could try."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is")
+        warnings.filterwarnings("ignore", ".*No render modes was declared in the environment")
+        check_env(gymnasium.make("es_service/Task-v0", task=POLE, max_episode_steps=30).unwrapped)
+    assert many(POLE).metadata["render_modes"] == []
+
+
 class Lane(gymnasium.Env[Any, Any]):
     """Environment 3 of seven, among others that get actions and seeds of their own."""
 
@@ -278,7 +289,7 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
 @pytest.mark.parametrize(
     ("call", "error", "sentence"),
     [
-        (lambda: many("point_mase"), TaskError, "'point_mase' is not shipped; choose among point_maze, ant_maze"),
+        (lambda: many("point_mase"), ServiceError, "'point_mase' is not shipped; choose among point_maze, ant_maze"),
         (lambda: many("gymnasium:Ant-v5"), TaskError, "'gymnasium:Ant-v5' is a Python object, no task in JAX"),
         (
             lambda: many("function:tests.examples.beam:beam"),
@@ -308,15 +319,15 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
         ),
         (lambda: many().frame(0), ValueError, "render_mode = None; must be 'rgb_array' for pictures"),
         (lambda: many(render_mode="rgb_array").frame(2), ValueError, "index = 2; must be from 0 to 1"),
-        (lambda: many().step(np.zeros((2, 2))), ValueError, "call reset before step"),
-        (lambda: many().get_state(), ValueError, "call reset before get_state"),
-        (lambda: TaskEnv("point_maze").get_state(), ValueError, "call reset before get_state"),
+        (lambda: many().step(np.zeros((2, 2))), ResetNeeded, "call reset before step"),
+        (lambda: many().get_state(), ResetNeeded, "call reset before get_state"),
+        (lambda: TaskEnv("point_maze").get_state(), ResetNeeded, "call reset before get_state"),
         (lambda: many().reset(seed=[1]), ValueError, "a list of 1; must have one for each of the 2"),
         (lambda: many().reset(seed=-1), ValueError, r"seed = -1; must be from 0 to 2\*\*63 - 1"),
         (lambda: many().reset(options={"reset_mask": [True]}), TypeError, "is list; must be a NumPy"),
         (lambda: many().reset(options=MASK), ValueError, OF_BOOLS),
         (lambda: TaskEnv("point_maze").step([0.0]), ValueError, r"the shape \(1,\); must be \(2,\)"),
-        (lambda: TaskEnv("point_maze").step([0.0, 0.0]), ValueError, "call reset before step"),
+        (lambda: TaskEnv("point_maze").step([0.0, 0.0]), ResetNeeded, "call reset before step"),
     ],
 )
 def test_a_wrong_argument_is_an_error_that_says_what_is_allowed(call, error, sentence):
@@ -393,7 +404,7 @@ def test_a_finished_episode_is_not_stepped_where_the_caller_resets():
     envs = TaskVectorEnv("point_maze", 2, max_episode_steps=1, autoreset_mode="Disabled")
     envs.reset(seed=0)
     envs.step(np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="the episode of environment 0 is over; reset it"):
+    with pytest.raises(ResetNeeded, match="the episode of environment 0 is over; reset it"):
         envs.step(np.zeros((2, 2)))
 
 

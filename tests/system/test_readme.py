@@ -119,6 +119,18 @@ def read(tmp_path_factory):
     return read
 
 
+@pytest.mark.slow
+def test_the_python_of_the_guides_type_checks_outside_of_the_clone(tmp_path):
+    """As in the editor of a user: nothing but the installed package says where it is, and what its functions take."""
+    for guide in BUDGET_S:
+        for number, (language, text) in enumerate(steps(guide)):
+            if language == "python":
+                (tmp_path / f"{guide.replace('/', '_')}_{number}.py").write_text(text)
+    words = ["pyright", "--pythonpath", sys.executable, tmp_path]
+    checked = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert checked.returncode == 0, checked.stdout
+
+
 @of_a_reader
 @pytest.mark.parametrize(("guide", "text"), STEPS, ids=[f"{guide}: {text.splitlines()[0]}" for guide, text in STEPS])
 def test_every_command_and_every_script_works(read, guide, text):
