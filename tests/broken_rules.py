@@ -660,6 +660,22 @@ CASES = [
             "pass",
         ),
     ),
+    *cases(
+        "a certified value",
+        "tests/es_service/test_targets.py",
+        (
+            "is that of the episodes that decided",
+            "es_service/runs/targets.py",
+            "episodes=episodes_of(decision.policy, number, Domain.CERTIFICATION_RESET),",
+            "episodes=decision.episodes,",
+        ),
+        (
+            "decides whether a run is over",
+            "es_service/runs/certified.py",
+            "if policy.decides is not False and policy.episodes.count",
+            "if policy.episodes.count",
+        ),
+    ),
 ]
 
 if __name__ == "__main__":

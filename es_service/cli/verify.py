@@ -48,7 +48,8 @@ def verify(
         if not as_json:
             what = f"differs: {', '.join(differences)}" if differences else "equal"
             since = f"; since it was made: {', '.join(changes)}" if changes else ""
-            print_line(console, f"certification {policy.number}, {policy.name}: {what}{since}")
+            kind = "decision" if policy.decides else "certification"
+            print_line(console, f"{kind} {policy.number}, {policy.name}: {what}{since}")
     why = ""
     if any(group.differences for group in groups) or any(differences for _, differences in certified):
         why = why_not_repeatable(run, changed_config(run.present_config, {}))

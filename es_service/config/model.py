@@ -162,8 +162,9 @@ class BudgetConfig(Section):
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
     target_certified: Number | None = Field(
         None,
-        description="Mean fitness in certified episodes that ends the run: the best centre is certified when its "
-        "evaluation reaches this, and the run continues if its new episodes do not.",
+        description="Mean fitness in 256 new episodes that ends the run: they decide on the best centre when its "
+        "evaluation reaches this, and the run continues if they do not. Its certified value is that of further "
+        "episodes.",
     )
 
 

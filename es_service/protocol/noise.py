@@ -52,6 +52,8 @@ class Domain(IntEnum):
     """Resets of our tasks as environments of other libraries."""
     CORRECTION_RESET = 10
     """Resets of episodes that say what the elites of a map are worth, from which the search learns nothing."""
+    DECISION_RESET = 11
+    """Resets of episodes that decide whether a run has reached `budget.target_certified`."""
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

@@ -13,6 +13,7 @@ from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
+from es_service.runs.certified import measure_of, tries_sentence
 from es_service.runs.identity import code_changes
 from es_service.runs.objectives import objectives, weights
 from es_service.runs.run_status import population_size, state
@@ -57,12 +58,14 @@ def _certified(data: RunData) -> str:
     """The value of the certified policy, as a sentence that others follow; empty if there is none."""
     if data.certified is None:
         return ""
-    row = data.certified.row()
-    value = f"{number(row['return_mean'])} ({number(row['return_low'])} to {number(row['return_high'])})"
+    row, measure = data.certified.row(), measure_of(data.constants["task.fitness"])
+    what = measure.replace("_", " ")
+    value = "{} ({} to {})".format(*(number(row[f"{measure}_{end}"]) for end in ("mean", "low", "high")))
     success = "" if row["successes"] is None else f" and succeeds in {row['successes']:,} of them"
+    tries = f" It passed in {tries_sentence(row['tries'])}." if row["tries"] else ""
     return (
-        f"The certified policy, {row['policy']}, has the return {value} in "
-        f"{counted(row['episodes'], 'episode')} that no choice has seen{success}. "
+        f"The certified policy, {row['policy']}, has a mean {what} of {value} in "
+        f"{counted(row['episodes'], 'episode')} that no choice has seen{success}.{tries} "
     )
 
 

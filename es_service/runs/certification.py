@@ -4,7 +4,8 @@ The stored value of an elite or of a best centre is the highest of many noisy me
 are therefore reduced by successive halving with *selection* episodes, and only the policies that remain get
 *certification* episodes. Both have a domain of random streams of their own, which no seed of `evaluate` reaches, and
 each certification of a run has new episodes. The certified policy is the one that the selection episodes put first,
-never the one with the best certified value.
+never the one with the best certified value. Whether a run has reached `budget.target_certified` is decided by episodes
+of a third domain (`targets.py`).
 
 Axes: N candidates, E episodes, D policy parameters, O observation.
 """
@@ -25,22 +26,22 @@ from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
-from es_service.protocol.messages import EpisodesResult, TaskSpec
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import Domain
 from es_service.runs.certified import (
     EPISODES,
     MEASURES,
     Certified,
     Measure,
+    all_certifications,
     arrays_of,
-    certified_policies,
     measure_of,
     stored,
 )
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
-from es_service.runs.selection import Parameters, halved, kept, new_episodes
+from es_service.runs.selection import Parameters, halved, new_episodes
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.store.writer import RunStore
@@ -52,7 +53,7 @@ TOP = 10
 
 
 @dataclass(frozen=True)
-class _Named:
+class Named:
     """A candidate."""
 
     name: str
@@ -100,10 +101,7 @@ def certify_run(
     for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("top", top or 0, 0)):
         whole(name, value, least)
     run = open_run(folder)
-    with _naming_this_call(), RunStore.open(run.folder) as store:
-        for notice in store.notices:
-            on_notice(notice)
-        config = evaluation_config(run, workers)
+    with opened(run, workers, on_notice) as (store, config):
         _measure(config, by)  # refused before workers start if wrong
         if top is None:
             top = TOP if config.map.enabled else 0
@@ -111,18 +109,24 @@ def certify_run(
         if not chosen:
             why = "its map is empty" if top else "no candidate is named"
             raise NotInRunError(f"{run.folder}: there is no policy to certify; {why}", run=run.folder)
-        with _engine(config, on_notice) as engine:
+        with workers_for(config, on_notice) as engine:
             number = store.next_certification
-            certified = _certify(engine, config, _different(chosen), number, episodes, keep, by)
+            certified = _certify(engine, config, different(chosen), number, episodes, keep, by)
         store.add_certification([stored(policy) for policy in certified])
     return certified
 
 
 @contextmanager
-def _naming_this_call() -> Iterator[None]:
-    """The store advises to resume a run after an error; here it is the certification that is repeated."""
+def opened(run: Run, workers: int | None, on_notice: Callable[[str], None]) -> Iterator[tuple[RunStore, RunConfig]]:
+    """The store of a run that no driver holds, and the config with which its policies are certified on this machine.
+
+    After an error, the store advises to resume the run; here it is the certification that is repeated.
+    """
     try:
-        yield
+        with RunStore.open(run.folder) as store:
+            for notice in store.notices:
+                on_notice(notice)
+            yield store, evaluation_config(run, workers)
     except StoreError as error:
         error.ways_out = tuple(
             replace(way, action="certify", purpose="certify it after the cause is removed")
@@ -168,24 +172,25 @@ def certify(
     task = task_of(config)
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
-    given = [_Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
-    with _engine(config) as engine:
+    given = [Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
+    with workers_for(config) as engine:
         return _certify(engine, config, given, OTHER_PROGRAMS + number, episodes, keep, by)
 
 
 def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...], list[str]]]:
-    """The stored certifications, each with the names of the results that differ if its episodes are run again, and with
-    what has changed in packages, processor and code since it was made, in words."""
-    certified = certified_policies(run.folder)
+    """The stored certifications and decisions, each with the names of the results that differ if its episodes are run
+    again, and with what has changed in packages, processor and code since it was made, in words."""
+    certified = all_certifications(run.folder)
     if not certified:
         return
     config = evaluation_config(run, workers)
-    now = _platform(config)
-    with _engine(config) as engine:
+    now = platform_of(config)
+    with workers_for(config) as engine:
         for policy in certified:
-            parameters = (policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
-            [result] = _certification_episodes(engine, [parameters], policy.episodes.count, config.seed, policy.number)
-            again, then = arrays_of(kept(result)), arrays_of(policy.episodes)
+            domain = Domain.DECISION_RESET if policy.decides else Domain.CERTIFICATION_RESET
+            asked = [policy.policy], policy.episodes.count, config.seed, policy.number
+            [episodes] = new_episodes(engine, *asked, 0, domain)
+            again, then = arrays_of(episodes), arrays_of(policy.episodes)
             equal = {name for name in then if name in again and then[name].tobytes() == again[name].tobytes()}
             yield policy, tuple(name for name in then if name not in equal), changes_since(policy.platform, now)
 
@@ -193,7 +198,7 @@ def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified
 def _certify(
     engine: Evaluator,
     config: RunConfig,
-    given: Sequence[_Named],
+    given: Sequence[Named],
     number: int,
     episodes: int,
     keep: int,
@@ -202,8 +207,8 @@ def _certify(
     """Select among candidates, then certify those that remain."""
     measure = _measure(config, by)
     ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
-    policies, platform = [given[record.index].policy for record in ranked], _platform(config)
-    results = _certification_episodes(engine, policies, episodes, config.seed, number)
+    policies, platform = [given[record.index].policy for record in ranked], platform_of(config)
+    results = new_episodes(engine, policies, episodes, config.seed, number, 0, Domain.CERTIFICATION_RESET)
     certified = []
     for rank, (record, result) in enumerate(zip(ranked, results, strict=True)):
         candidate = given[record.index]
@@ -219,28 +224,24 @@ def _certify(
                 record.count,
                 len(given),
                 steps,
+                False,
+                0,
                 platform,
-                kept(result),
+                result,
                 *candidate.policy,
             )
         )
     return certified
 
 
-def _certification_episodes(
-    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int
-) -> list[EpisodesResult]:
-    return new_episodes(engine, policies, episodes, seed, number, 0, Domain.CERTIFICATION_RESET)
-
-
-def _platform(config: RunConfig) -> dict[str, Any]:
+def platform_of(config: RunConfig) -> dict[str, Any]:
     """What computes episodes in this process, as it is stored."""
     return {**platform_info(), CODE: code_of(config)}
 
 
-def _different(chosen: Sequence[Candidate]) -> list[_Named]:
+def different(chosen: Sequence[Candidate]) -> list[Named]:
     """The candidates; of equal policies only the first, since the best centre is often an elite as well."""
-    different: dict[tuple[bytes, ...], _Named] = {}
+    found: dict[tuple[bytes, ...], Named] = {}
     for candidate in chosen:
         policy = (
             candidate.policy.parameters_D,
@@ -248,11 +249,11 @@ def _different(chosen: Sequence[Candidate]) -> list[_Named]:
             candidate.policy.observation_std_O,
         )
         key = tuple(array.tobytes() for array in policy)
-        different.setdefault(key, _Named(candidate.name, policy, candidate.generation, candidate.stored_fitness))
-    return list(different.values())
+        found.setdefault(key, Named(candidate.name, policy, candidate.generation, candidate.stored_fitness))
+    return list(found.values())
 
 
-def _engine(
+def workers_for(
     config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None
 ) -> AbstractContextManager[Evaluator]:
     """Workers on this machine that give what certification keeps."""

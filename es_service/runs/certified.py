@@ -1,11 +1,14 @@
 """Certified policies: their values in episodes that no choice has seen, as a run stores them.
 
+Beside them are the decisions: episodes of best centres that say whether a run has reached `budget.target_certified`.
+Who asks that reads only decisions, and who reports a value reads only the others.
+
 Axes: E episodes, D policy parameters, O observation, B descriptor dimensions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import FloatArray
-from es_service.runs.intervals import mean_interval, share_interval
+from es_service.runs.intervals import false_pass_share, mean_interval, share_interval
 from es_service.store.certifications import CertifiedRow
 from es_service.store.reader import read_certifications
 
 EPISODES = 256
-"""Certification episodes of a policy, unless a call says otherwise."""
+"""Certification episodes of a policy, unless a call says otherwise; and the episodes of a decision."""
+BELOW = 0.1
+"""Standard deviations below a target of the policies by which it is said how easily a decision is lucky."""
 Measure = Literal["return", "last_reward", "success", "goal_distance"]
 """What selection episodes rank by; the least goal distance ranks by its negative, since higher is better."""
 MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -41,9 +46,23 @@ class Episodes:
     descriptor_E_B: NDArray[np.float64]
 
     @property
+    def steps(self) -> int:
+        """Environment steps of all episodes."""
+        return int(self.steps_E.sum())
+
+    @property
     def count(self) -> int:
         """Number of episodes."""
         return self.return_E.size
+
+    def fitness(self, kind: str) -> NDArray[np.float64]:
+        """Fitness of each episode, [E]; `kind` is `task.fitness`."""
+        return self.return_E if kind == "sum" else self.last_reward_E
+
+    def mean_fitness(self, kind: str) -> float:
+        """Mean of `fitness`."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return float(self.fitness(kind).mean())
 
     def values(self) -> dict[str, float | int | None]:
         """Means with their intervals, and successes, by column name; None for what the task does not have."""
@@ -78,12 +97,22 @@ class Certified:
     """Number of policies from which it was chosen."""
     selection_steps: int
     """Environment steps of all selection episodes of the certification, which belong to the cost of the result."""
+    decides: bool | None
+    """Whether the episodes decided if the run has reached `budget.target_certified`; None: of a version before 0.24,
+    whose certifications both decided and reported."""
+    tries: int
+    """Number of this decision, from 1, or of those until the run was over; 0 if no decision belongs to it."""
     platform: Mapping[str, Any]
     """Packages, processor and code that computed it; see `runs.identity.changes_since`."""
     episodes: Episodes
     parameters_D: FloatArray
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
+
+    @property
+    def policy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Its parameters, and mean and standard deviation of its observations."""
+        return self.parameters_D, self.observation_mean_O, self.observation_std_O
 
     def row(self) -> dict[str, Any]:
         """The policy as a row of a table."""
@@ -98,20 +127,53 @@ class Certified:
             "selection_mean": self.selection_mean,
             "selection_episodes": self.selection_episodes,
             "selection_steps": self.selection_steps,
+            "decides": self.decides,
+            "tries": self.tries,
             "episodes": self.episodes.count,
             **self.episodes.values(),
         }
 
 
-def certified_policies(folder: Path) -> list[Certified]:
-    """All certified policies of a run, in the order of certification and rank. Raises StoreError if one is damaged."""
+def all_certifications(folder: Path) -> list[Certified]:
+    """All certified policies and all decisions of a run, in the order of certification and rank. Raises StoreError if
+    one is damaged."""
     return [_from_row(row) for row in read_certifications(folder)]
+
+
+def certified_policies(folder: Path) -> list[Certified]:
+    """All certified policies of a run, without the decisions; otherwise as `all_certifications`."""
+    return [policy for policy in all_certifications(folder) if not policy.decides]
 
 
 def newest_certified(folder: Path) -> Certified | None:
     """The policy that the newest certification of a run has put first; None if there is none, or if damage has removed
-    it. No other certification is read. Raises StoreError if it is damaged."""
-    return next((_from_row(row) for row in read_certifications(folder, newest=True) if row.rank == 0), None)
+    it. No older certification is read. Raises StoreError if it is damaged."""
+    rows = read_certifications(folder, newest=lambda facts: not facts.get("decides"))
+    return next((_from_row(row) for row in rows if row.rank == 0), None)
+
+
+def decisions(policies: Iterable[Certified]) -> list[Certified]:
+    """Those of a run's certifications whose episodes decide if it has reached `budget.target_certified`."""
+    return [policy for policy in policies if policy.decides is not False and policy.episodes.count >= EPISODES]
+
+
+def passed(policies: Iterable[Certified], target: float, fitness: str) -> Certified | None:
+    """The first decision whose mean fitness reaches a target; None if none does."""
+    reaching = (one for one in decisions(policies) if one.episodes.mean_fitness(fitness) >= target)
+    return next(reaching, None)
+
+
+def report_of(policies: Iterable[Certified], decision: Certified) -> Certified | None:
+    """The certified value of a policy that has passed a decision: of later episodes, which decide nothing. None if it
+    is still missing. Before 0.24, the episodes of the decision were quoted."""
+    if decision.decides is None:
+        return decision
+    later = (one for one in policies if one.number > decision.number and one.decides is False)
+    return next((one for one in later if one.episodes.count >= EPISODES and _same_policy(one, decision)), None)
+
+
+def _same_policy(one: Certified, other: Certified) -> bool:
+    return all(ours.tobytes() == theirs.tobytes() for ours, theirs in zip(one.policy, other.policy, strict=True))
 
 
 def measure_of(fitness: str) -> Measure:
@@ -120,20 +182,32 @@ def measure_of(fitness: str) -> Measure:
 
 
 def target_reached(folder: Path, target: float | None, fitness: str) -> str:
-    """Why a run is over whose `budget.target_certified` and `task.fitness` these are, in words; empty if no certified
-    policy with EPISODES episodes or more reaches the target, by whatever it was selected."""
+    """Why a run is over whose `budget.target_certified` and `task.fitness` these are, in words; empty if no decision
+    reaches the target, or if the certified value of the policy that does is still missing."""
     if target is None:
         return ""
-    for policy in certified_policies(folder):
-        if policy.episodes.count < EPISODES:
-            continue
-        mean = policy.row()[f"{measure_of(fitness)}_mean"]
-        if mean is not None and mean >= target:
-            return (
-                f"the target {target:g} is reached: a policy of generation {policy.generation} has {mean:.6g} in "
-                f"{policy.episodes.count} certified episodes"
-            )
-    return ""
+    policies = all_certifications(folder)
+    decision = passed(policies, target, fitness)
+    report = decision and report_of(policies, decision)
+    if decision is None or report is None:
+        return ""
+    mean, value = (one.episodes.mean_fitness(fitness) for one in (decision, report))
+    what = (
+        f"the target {target:g} is reached: a policy of generation {decision.generation} has {mean:.6g} in the "
+        f"{decision.episodes.count} episodes that decide"
+    )
+    if report is decision:
+        return f"{what}, which a version before 0.24 also quoted; certify it again for a value that decides nothing"
+    below = ", below the target" if value < target else ""
+    return f"{what} (try {report.tries}), and {value:.6g} in {report.episodes.count} further certified ones{below}"
+
+
+def tries_sentence(tries: int) -> str:
+    """How easily a run of so many decisions ends by luck, in words."""
+    share = 100 * false_pass_share(tries, EPISODES, BELOW)
+    which = "a policy" if tries == 1 else f"at least one of {tries:,} policies"
+    lucky = f"{which} {BELOW:g} standard deviations below it would pass with {share:.1f} %"
+    return f"try {tries:,} to reach the target ({lucky})"
 
 
 def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
@@ -154,7 +228,8 @@ def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def _from_row(row: CertifiedRow) -> Certified:
     arrays: dict[str, Any] = {"success_E": None, **row.arrays}
     policy = {name: arrays.pop(name) for name in _POLICY}
-    return Certified(row.number, row.rank, **row.facts, **policy, episodes=Episodes(**arrays))
+    facts = {"decides": None, "tries": 0, **row.facts}
+    return Certified(row.number, row.rank, **facts, **policy, episodes=Episodes(**arrays))
 
 
 def _interval(name: str, values_E: NDArray[np.float64] | None) -> dict[str, float | None]:

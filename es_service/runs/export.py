@@ -59,8 +59,8 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
 
 def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
     """Names and content of history, evaluated centres, novelty archive and, where there are any, the map, the
-    parameters of a function that is the task, and the certified policies; all but the last as of one generation. They
-    come one by one, because the first two may be large.
+    parameters of a function that is the task, the certified policies, and the decisions on `budget.target_certified`;
+    all but the last two as of one generation. They come one by one, because the first two may be large.
 
     The parameters are those of the best centre, of the newest one (if the generation evaluated one) and of the elites:
     `which` is best, centre or the place of a cell, such as 3,17; then each parameter in the units of the function."""
@@ -74,6 +74,8 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
         yield "parameters", _parameters(snapshot, run.parameter_spec, has_map=run.constants["map.enabled"])
     if not (certified := run.certified).empty:
         yield "certified", certified
+    if not (decisions := run.decisions).empty:
+        yield "decisions", decisions
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:

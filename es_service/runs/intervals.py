@@ -39,3 +39,11 @@ def share_interval(successes: int, count: int) -> tuple[float, float]:
     middle = (share + z * z / (2.0 * count)) / grown
     half = z * math.sqrt(share * (1.0 - share) / count + z * z / (4.0 * count * count)) / grown
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def false_pass_share(tries: int, episodes: int, below: float) -> float:
+    """Probability that at least one of so many policies, whose expected fitness is `below` standard deviations of an
+    episode's fitness below a target, has a mean over so many episodes that reaches it (normal approximation)."""
+    from scipy.stats import norm
+
+    return 1.0 - float(norm.cdf(below * math.sqrt(episodes))) ** tries

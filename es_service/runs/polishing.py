@@ -52,8 +52,9 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
 def certified_for(
     run: Run, config: RunConfig, on_notice: Callable[[str], None], *, workers: int | None, centre: bool = False
 ) -> list[Certified]:
-    """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, and
-    selected by the same measure before and after. What is not certified so is certified now.
+    """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, of
+    which none has decided that the run is over, and selected by the same measure before and after. What is not
+    certified so is certified now.
 
     With a target set in a task that declares success, policies are selected by success.
 
@@ -71,7 +72,7 @@ def certified_for(
     certified = [
         policy
         for policy in certified_policies(run.folder)
-        if policy.selected_by == by and policy.episodes.count >= EPISODES
+        if policy.selected_by == by and policy.episodes.count >= EPISODES and policy.decides is False
     ]
     if certified:
         newest = max(policy.number for policy in certified)

@@ -114,7 +114,7 @@ def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Can
     """
     policy, certified = run.policy("certified"), newest_certified(run.folder)
     assert certified is not None
-    fitness_E = certified.episodes.return_E if config.task.fitness == "sum" else certified.episodes.last_reward_E
+    fitness_E = certified.episodes.fitness(config.task.fitness)
     episode = int(np.argsort(fitness_E, kind="stable")[(fitness_E.size - 1) // 2])
     candidate = Candidate(CERTIFIED, policy, certified.number, float(fitness_E.mean()))
     centre = centre_of(policy, certified.number)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from es_service.loop.generation import steps_of
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.episodes import part_of
 from es_service.protocol.evaluator import Evaluator
@@ -70,10 +69,8 @@ def halved(
     while len(left) > 1:
         policies = [given[record.index] for record in left]
         results = new_episodes(engine, policies, episodes, seed, number, ask, Domain.CANDIDATE_RESET)
-        steps += sum(map(steps_of, results))
-        left = [
-            replace(record, rounds=(*record.rounds, kept(result))) for record, result in zip(left, results, strict=True)
-        ]
+        steps += sum(result.steps for result in results)
+        left = [replace(record, rounds=(*record.rounds, result)) for record, result in zip(left, results, strict=True)]
         ranked = sorted(left, key=lambda record: record.order(by))  # stable: equal ones stay in the order given
         if len(left) <= keep:
             return ranked, steps
@@ -84,8 +81,8 @@ def halved(
 
 def new_episodes(
     engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
-) -> list[EpisodesResult]:
-    """Results [E] of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
+) -> list[Episodes]:
+    """What is kept of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
     number, ask) determines."""
     asked = [
         policy_work(
@@ -102,10 +99,10 @@ def new_episodes(
     work: list[Work] = [subject_chunk for each in asked for subject_chunk in each.work]
     answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
     results = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
-    return [part_of(result, 0) for result in results]
+    return [_kept(part_of(result, 0)) for result in results]
 
 
-def kept(result: EpisodesResult) -> Episodes:
+def _kept(result: EpisodesResult) -> Episodes:
     """What is kept of the results [E] of a policy."""
     return Episodes(
         result.returns.astype(np.float64),

@@ -17,7 +17,7 @@ from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, Parts, elite_part
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
-from es_service.runs.certified import certified_policies, newest_certified
+from es_service.runs.certified import all_certifications, certified_policies, newest_certified
 from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
@@ -183,6 +183,16 @@ class Run:
         import pandas as pd
 
         return pd.DataFrame([policy.row() for policy in certified_policies(self.folder)])
+
+    @property
+    def decisions(self) -> pd.DataFrame:
+        """The tries to reach `budget.target_certified`, with the columns of `certified`; empty if there are none.
+
+        They decide whether the run is over, so the value of a policy that has passed is too good on average.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([policy.row() for policy in all_certifications(self.folder) if policy.decides])
 
     @property
     def descriptor_names(self) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,11 +58,14 @@ def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None
     return max(stored, (parent or {}).get(CERTIFICATIONS, 0))
 
 
-def rows(connection: sqlite3.Connection, *, newest: bool = False) -> list[tuple[Key, CertifiedRow | None]]:
+def rows(
+    connection: sqlite3.Connection, newest: Callable[[Mapping[str, Any]], bool] | None = None
+) -> list[tuple[Key, CertifiedRow | None]]:
     """The rows that were not removed, in the order of number and rank; None for the content of a damaged one.
 
     Args:
-        newest: only the rows of the newest certification of which there are any.
+        newest: facts of a row -> whether it is wanted; then only the rows of the newest certification that has wanted
+            or damaged ones.
     """
     row_list: list[tuple[Key, CertifiedRow | None]] = []
     query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number"
@@ -71,7 +74,7 @@ def rows(connection: sqlite3.Connection, *, newest: bool = False) -> list[tuple[
             break
         if not isinstance(payload, bytes) or _sha256(number, rank, facts, payload) != sha256:
             row_list.append(((number, rank), None))
-        elif facts != _REMOVED:
+        elif facts != _REMOVED and (newest is None or newest(json.loads(facts))):
             row_list.append(((number, rank), CertifiedRow(number, rank, json.loads(facts), decode_part(payload))))
     return row_list
 

@@ -7,7 +7,7 @@ functions that take a folder raise StoreError as `reading` does, and if what the
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -188,11 +188,12 @@ def next_certification(folder: Path) -> int:
         return certifications.next_number(connection, meta.parent)
 
 
-def read_certifications(folder: Path, *, newest: bool = False) -> list[CertifiedRow]:
-    """All certified policies, in the order of certification and rank; with `newest` those of the last certification."""
+def read_certifications(folder: Path, newest: Callable[[Mapping[str, Any]], bool] | None = None) -> list[CertifiedRow]:
+    """All certified policies, in the order of certification and rank; with `newest`, those of the last certification
+    whose facts are wanted."""
     with reading(folder) as (connection, _):
         rows = []
-        for (number, rank), row in certifications.rows(connection, newest=newest):
+        for (number, rank), row in certifications.rows(connection, newest):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} does not match its SHA-256")
             rows.append(row)

@@ -14,7 +14,11 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import column_bytes, text_sha256
 
-SCHEMA_VERSION = 6
+SCHEMA = "schema_version"
+"""Record of the table `meta` with the schema version."""
+SCHEMA_VERSION = 7
+OLDEST_VERSION = 6
+"""Oldest schema version that is read and continued. In 6, a certification does not say whether it decided something."""
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
@@ -107,7 +111,7 @@ def create_tables(connection: sqlite3.Connection, meta: RunMeta) -> None:
         connection.execute("BEGIN IMMEDIATE")
         for statement in table_statements(meta.columns).values():
             connection.execute(statement)
-        put_meta(connection, "schema_version", str(SCHEMA_VERSION))
+        put_meta(connection, SCHEMA, str(SCHEMA_VERSION))
         put_meta(connection, "run", json.dumps(asdict(meta), sort_keys=True))
 
 
@@ -134,7 +138,7 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         if text_sha256(str(key), str(value)) != sha256:
             raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
     records = {key: value for key, value, _ in rows}
-    version = int(records.get("schema_version", 0))
+    version = int(records.get(SCHEMA, 0))
     if version > SCHEMA_VERSION:
         raise StoreError(
             f"{file} has schema version {version}; this version of es-service supports versions up to "
@@ -142,10 +146,11 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         )
     if version < 1 or "run" not in records:
         raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")
-    if version < SCHEMA_VERSION:
+    if version < OLDEST_VERSION:
         raise StoreError(
             f"{file} was written by an older version of es-service; use version {READ_BY[version]} to read or continue "
-            f"it (its schema version is {version}, and this version of es-service supports {SCHEMA_VERSION})"
+            f"it (its schema version is {version}, and this version of es-service supports {OLDEST_VERSION} to "
+            f"{SCHEMA_VERSION})"
         )
     fields = json.loads(records["run"])
     columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}

@@ -30,7 +30,7 @@ from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
 from es_service.store.rows import history_rows, insert_history
-from es_service.store.schema import Damaged, RunMeta
+from es_service.store.schema import SCHEMA, SCHEMA_VERSION, Damaged, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_state, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
@@ -217,6 +217,7 @@ class RunStore:
         StoreError if the database cannot be written."""
         number = self.next_certification
         with self._transaction("storing a certification") as connection:
+            put_meta(connection, SCHEMA, str(SCHEMA_VERSION))  # from here on, older versions cannot read all rows
             certifications.insert(connection, number, policies)
         self.upkeep.after_commit()
 

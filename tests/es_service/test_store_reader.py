@@ -12,7 +12,6 @@ import pytest
 
 from es_service.errors import StoreError
 from es_service.store import connection as store_connection
-from es_service.store import schema as store_schema
 from es_service.store.reader import (
     read_generation,
     read_history,
@@ -21,8 +20,9 @@ from es_service.store.reader import (
     read_parts,
     read_platforms,
 )
+from es_service.store.schema import put_meta
 from es_service.store.writer import RunStore
-from tests.database import execute
+from tests.database import database, execute
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,
@@ -116,14 +116,14 @@ def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("version", "message"),
     [
-        (7, r"schema version 7; .* versions up to 6\. Upgrade"),
-        (1, r"use version 0\.1 to read or continue it .* is 1, .* es-service supports 6"),
+        (8, r"schema version 8; .* versions up to 7\. Upgrade"),
+        (1, r"use version 0\.1 to read or continue it .* is 1, .* es-service supports 6 to 7"),
     ],
 )
-def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkeypatch, version, message):
-    with monkeypatch.context() as patch:
-        patch.setattr(store_schema, "SCHEMA_VERSION", version)
-        folder = finished(tmp_path / "run", 1)
+def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, version, message):
+    folder = finished(tmp_path / "run", 1)
+    with database(folder / "run.db") as connection:
+        put_meta(connection, "schema_version", str(version))
     for use in (RunStore.open, read_meta, read_history):
         with pytest.raises(StoreError, match=message):
             use(folder)

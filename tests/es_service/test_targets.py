@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from es_service import api
+from es_service.protocol.noise import Domain
 from es_service.runs import run_status, targets
-from es_service.runs.certification import certify_run
-from es_service.runs.certified import certified_policies, target_reached
+from es_service.runs.certification import Named, certify_run
+from es_service.runs.certified import (
+    EPISODES,
+    Certified,
+    Episodes,
+    all_certifications,
+    certified_policies,
+    target_reached,
+    tries_sentence,
+)
+from es_service.runs.intervals import false_pass_share, mean_interval
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
+from es_service.store.schema import get_meta
+from tests.database import as_0_23_wrote_it, database
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
@@ -21,6 +35,14 @@ CONFIG = {
     "budget": {"generations": 40},
     "compute": {"engine": "inline", "workers": 1},
 }
+
+
+RUNS = 2000
+
+
+def decided(folder):
+    """The decisions of a run."""
+    return [one for one in all_certifications(folder) if one.decides]
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +56,16 @@ def test_it_ends_at_the_first_best_centre_that_new_episodes_confirm_and_its_bits
 ):
     target = float(whole.history["best_fitness"].iloc[0]) - 0.5
     outcome = api.run(api.load_config(CONFIG, [f"budget.target_certified={target}"]), tmp_path / "run")
-    run, tested = outcome.run, certified_policies(tmp_path / "run")
+    run, tested, [report] = outcome.run, decided(tmp_path / "run"), certified_policies(tmp_path / "run")
     assert f"the target {target:g} is reached: a policy of generation {tested[-1].generation}" in outcome.reason
     assert run.generation < 40
     means = [one.row()["return_mean"] for one in tested]
+    assert [one.tries for one in tested] == [*range(1, len(tested) + 1)]
+    assert (report.tries, report.decides, report.generation) == (len(tested), False, tested[-1].generation)
+    assert report.selection_mean == means[-1]
+    assert report.selection_steps == sum(int(one.episodes.steps_E.sum()) for one in tested)
+    assert not set(report.episodes.return_E) & set(tested[-1].episodes.return_E), "other episodes"
+    assert len(run.decisions) == len(tested)
     assert means[-1] >= target > max(means[:-1], default=-np.inf)
     assert [one.stored_fitness for one in tested] == sorted({one.stored_fitness for one in tested})
     until = run.generation
@@ -53,8 +81,9 @@ def test_it_ends_at_the_first_best_centre_that_new_episodes_confirm_and_its_bits
 def test_lucky_evaluations_do_not_end_a_run(whole, tmp_path):
     target = float(np.quantile(whole.history["best_fitness"], 0.4))
     outcome = api.run(api.load_config(CONFIG, [f"budget.target_certified={target}"]), tmp_path / "run")
-    tested = certified_policies(tmp_path / "run")
+    tested = decided(tmp_path / "run")
     assert len(tested) > 1
+    assert certified_policies(tmp_path / "run") == []
     assert all(one.row()["return_mean"] < target <= one.stored_fitness for one in tested)
     assert outcome.reason == "the budget of 40 generations is spent"
     assert outcome.run.digest() == whole.digest()
@@ -74,6 +103,62 @@ def test_a_run_that_was_interrupted_before_its_certification_begins_with_it(whol
             api.run(config, tmp_path / "run")
     outcome = api.resume(tmp_path / "run")
     assert (outcome.reason, outcome.run.digest()) == (expected.reason, expected.run.digest())
+
+
+def test_a_run_that_was_interrupted_after_its_decision_is_over_once_the_value_is_certified(tmp_path, monkeypatch):
+    config = api.load_config(CONFIG, ["budget.target_certified=-1000"])
+    expected = api.run(config, tmp_path / "expected")
+    run_episodes = targets.new_episodes
+
+    def interrupted(*asked: object) -> object:
+        if asked[-1] == Domain.CERTIFICATION_RESET:
+            raise KeyboardInterrupt
+        return run_episodes(*asked)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(targets, "new_episodes", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            api.run(config, tmp_path / "run")
+    run = api.open_run(tmp_path / "run")
+    assert not run_status.read_status(run).reasons, "a sweep does not leave it alone"
+    outcome = api.resume(run.folder)
+    assert outcome.reason == expected.reason
+    ours, theirs = certified_policies(run.folder), certified_policies(tmp_path / "expected")
+    assert [one.episodes.return_E.tolist() for one in ours] == [one.episodes.return_E.tolist() for one in theirs]
+    assert run.decisions["tries"].tolist() == [1]
+
+
+def test_no_resume_is_decided_by_the_episodes_that_are_reported(tmp_path):
+    """The two means of the policy that ends this run differ. With a target between them, the decision counts."""
+    config = api.load_config(CONFIG, ["budget.target_certified=-1000", "budget.generations=1"])
+    folder = api.run(config, tmp_path / "run").run.folder
+    [decision], [report] = (
+        one["return_mean"].tolist() for one in (api.open_run(folder).decisions, api.open_run(folder).certified)
+    )
+    between = (decision + report) / 2
+    reason = target_reached(folder, between, "sum")
+    assert bool(reason) == (decision > report)
+    assert target_reached(folder, min(decision, report) - 1.0, "sum")
+    assert not target_reached(folder, max(decision, report) + 1.0, "sum")
+    if reason:
+        assert reason.endswith("further certified ones, below the target")
+
+
+def test_a_policy_that_passes_a_lower_target_than_it_was_tried_with_is_certified(tmp_path):
+    config = api.load_config(CONFIG, ["budget.generations=1"])
+    folder = api.run(config, tmp_path / "run").run.folder
+    best = float(api.open_run(folder).history["best_fitness"].iloc[-1])
+    [decision] = fail_one_try(folder, best)
+    outcome = api.resume(folder, {"budget.target_certified": decision.row()["return_mean"] - 1.0})
+    assert "(try 1)" in outcome.reason
+    assert len(decided(folder)) == len(certified_policies(folder)) == 1
+
+
+def fail_one_try(folder, best):
+    """The decision of a run whose target is the fitness of its best centre, which it does not reach."""
+    outcome = api.resume(folder, {"budget.target_certified": best})
+    assert outcome.reason == "the budget of 1 generations is spent"
+    return decided(folder)
 
 
 def test_the_last_generation_of_a_budget_is_certified_too(whole, tmp_path):
@@ -115,15 +200,98 @@ def test_a_policy_that_was_selected_by_something_else_reaches_the_target_by_its_
     assert run_status.state(run_status.read_status(run)).startswith("finished: the budget of 1 generations")
 
 
-def test_a_certification_of_few_episodes_neither_reaches_the_target_nor_stands_for_the_run_s_own(tmp_path):
+@pytest.mark.parametrize("episodes", [16, 256])
+def test_a_certification_neither_reaches_the_target_nor_stands_for_the_run_s_own(episodes, tmp_path):
     run = api.run(api.load_config(CONFIG, ["budget.generations=1"]), tmp_path / "run").run
     target = float(run.history["best_fitness"].iloc[-1]) - 1.0
-    [few] = certify_run(run.folder, top=0, episodes=16)
-    assert few.row()["return_mean"] >= target
+    [given] = certify_run(run.folder, top=0, episodes=episodes)
+    assert given.row()["return_mean"] >= target
     assert target_reached(run.folder, target, "sum") == ""
     outcome = api.resume(run.folder, {"budget.target_certified": target, "budget.generations": 2})
     assert outcome.reason.startswith(f"the target {target:g} is reached")
-    assert [one.episodes.count for one in certified_policies(run.folder)] == [16, 256]
+    assert [one.episodes.count for one in certified_policies(run.folder)] == [episodes, 256]
+    assert [one.number for one in all_certifications(run.folder)] == [0, 1, 2]
+    assert [one.decides for one in all_certifications(run.folder)] == [False, True, False]
+
+
+def test_certifications_of_a_run_of_0_23_are_read_and_it_remains_over(tmp_path):
+    """Until then, a certification did not say whether it decided something; its episodes decided and were quoted."""
+    config = api.load_config(CONFIG, ["budget.target_certified=-1000"])
+    run = api.run(config, tmp_path / "run").run
+    digest = run.digest()
+    as_0_23_wrote_it(run.folder)
+    [policy] = certified_policies(run.folder)
+    assert (policy.decides, policy.tries, policy.name, len(policy.episodes.return_E)) == (None, 0, "best", 256)
+    assert run.certified["return_mean"].tolist() == [policy.row()["return_mean"]]
+    assert run.policy("certified").parameters_D.tolist() == policy.parameters_D.tolist()
+    assert run.decisions.empty
+    reason = api.resume(run.folder).reason
+    assert reason.startswith("the target -1000 is reached")
+    assert "certify it again" in reason
+    [again] = certify_run(run.folder, top=0)
+    assert [one.decides for one in certified_policies(run.folder)] == [None, False]
+    assert again.number == policy.number + 1
+    assert run.digest() == digest
+    assert get_schema(run.folder) == "7", "0.23 says that it cannot read the new rows"
+
+
+def get_schema(folder):
+    with database(folder / "run.db") as connection:
+        return get_meta(connection, "schema_version")
+
+
+def made_up_episodes(kind, rng, mean):
+    """Outcomes of EPISODES episodes of a policy with this expected fitness, and its standard deviation."""
+    shape = {
+        "normal": lambda: rng.normal(mean, 1.0, EPISODES),
+        "skewed": lambda: mean + 1.0 - rng.exponential(1.0, EPISODES),
+        "yes/no": lambda: (rng.random(EPISODES) < mean).astype(float),
+    }[kind]()
+    success_E = shape > 0.5 if kind == "yes/no" else None
+    nan_E = np.full(EPISODES, np.nan)
+    return Episodes(shape, shape, nan_E, success_E, np.ones(EPISODES, np.int64), np.zeros((EPISODES, 2)))
+
+
+def test_how_easily_a_run_ends_by_luck_is_said_with_the_number_of_its_tries():
+    """256 episodes have a standard error of 1/16: 0.1 standard deviations are 1.6 of it, which 5.48 % exceed."""
+    assert false_pass_share(1, 256, 0.1) == pytest.approx(0.0548, abs=1e-4)
+    assert false_pass_share(20, 256, 0.1) == pytest.approx(1.0 - (1.0 - 0.0548) ** 20, abs=1e-3)
+    assert tries_sentence(20).startswith("try 20 to reach the target (at least one of 20 policies 0.1 standard")
+    assert "would pass with 67.6 %" in tries_sentence(20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "target", "sd"), [("normal", 0.0, 1.0), ("skewed", 0.0, 1.0), ("yes/no", 0.6, 0.49)])
+def test_the_interval_of_what_ends_a_run_holds_the_truth_in_95_of_100_made_up_runs(kind, target, sd):
+    """The first best centre that is tried is 0.1 standard deviations below the target, and each later one is better by
+    0.02. A run ends by the first that passes, most often by luck, so the intervals of the episodes that decide hold the
+    truth less often."""
+    held, successes_held, decision_held, below = 0, 0, 0, 0
+    for run in range(RUNS):
+        policies: list[Certified] = []
+        for tried in itertools.count():
+            truth, fitness = target + sd * (0.02 * tried - 0.1), target + tried
+
+            def episodes_of(policy, number, domain, run=run, truth=truth):
+                return made_up_episodes(kind, np.random.default_rng([run, number, domain]), truth)
+
+            assert targets.due_after(policies, target, "sum")({"best_fitness": fitness})
+            best = Named("best", (np.array([tried]), np.zeros(1), np.ones(1)), tried, fitness)
+            policies += targets.attempt(policies, best, len(policies), target, "sum", {}, episodes_of)
+            if not policies[-1].decides:
+                break
+        *_, decision, report = policies
+        assert (report.tries, report.policy) == (tried + 1, best.policy)
+        assert not targets.due_after(policies, target, "sum")({"best_fitness": fitness + 1})
+        row, (_, low, high) = report.row(), mean_interval(decision.episodes.return_E)
+        held += row["return_low"] <= truth <= row["return_high"]
+        decision_held += low <= truth <= high
+        successes_held += kind == "yes/no" and row["success_low"] <= truth <= row["success_high"]
+        below += row["return_mean"] < target
+    assert 0.93 * RUNS <= held <= 0.97 * RUNS
+    assert kind != "yes/no" or 0.93 * RUNS <= successes_held <= 0.97 * RUNS
+    assert decision_held < 0.9 * RUNS
+    assert below > 0.3 * RUNS, "these runs are over, too"
 
 
 def test_a_sweep_leaves_alone_what_has_reached_its_target(whole, tmp_path):

@@ -114,12 +114,17 @@ def test_no_other_purpose_has_the_episodes_of_a_certification():
     episode_E = np.arange(64)
     streams = {
         tuple(key)
-        for domain in (Domain.EVALUATION_RESET, Domain.CANDIDATE_RESET, Domain.CERTIFICATION_RESET)
+        for domain in (
+            Domain.EVALUATION_RESET,
+            Domain.CANDIDATE_RESET,
+            Domain.DECISION_RESET,
+            Domain.CERTIFICATION_RESET,
+        )
         for generation in (0, 1, 2, FRESH_GENERATION, FRESH_GENERATION + 1)
         for ask in (0, 1)
         for key in stream_keys(4, domain, generation, episode_E, 0, ask).tolist()
     }
-    assert len(streams) == 3 * 5 * 2 * 64
+    assert len(streams) == 4 * 5 * 2 * 64
 
 
 def test_a_repeated_certification_has_new_episodes_and_all_are_listed(finished):
@@ -283,7 +288,7 @@ def test_the_command_line_certifies_and_shows_it(finished, tmp_path):
     assert [one["differences"] for one in json.loads(verified.stdout)["certified"]] == [[]] * 5
     es_service.write_report(folder, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert f"The certified policy, {row['policy']}, has the return" in page
+    assert f"The certified policy, {row['policy']}, has a mean return of" in page
     exported = CliRunner().invoke(app, ["export", str(folder), "--to", "csv", "--out", str(tmp_path / "out")])
     assert exported.exit_code == 0, exported.output
     assert len((tmp_path / "out" / "certified.csv").read_text().splitlines()) == 1 + 5

@@ -16,6 +16,7 @@ from es_service.runs.polishing import certified_for, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
+from tests.database import as_0_23_wrote_it
 from tests.laws.test_objectives import results_of
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -167,6 +168,30 @@ def test_the_budget_is_the_other_run_s_steps_unless_a_limit_is_given(parent):
     assert polish_config(parent.folder).budget.env_steps == steps
     assert polish_config(parent.folder, ["budget.target_fitness=3"]).budget.env_steps == steps
     assert polish_config(parent.folder, {"budget.generations": 3}).budget.env_steps is None
+
+
+def test_values_that_decided_that_a_run_is_over_are_not_compared(tmp_path):
+    """Of a parent that ended by `target_certified`, the further episodes are; where there are none, it is certified."""
+    run = api.run(api.load_config(PARENT, ["budget.target_certified=-1000"]), tmp_path / "run").run
+    config = polish_config(run.folder)
+    [reported] = certified_for(run, config, pytest.fail, workers=1)
+    assert (reported.number, reported.decides, reported.tries) == (1, False, 1)
+    as_0_23_wrote_it(run.folder)
+    [again] = certified_for(run, config, pytest.fail, workers=1)
+    assert (again.number, again.decides, again.tries) == (1, False, 0)
+
+
+def test_a_polish_that_a_target_ends_says_how_often_it_was_tried(parent, tmp_path):
+    words = ["polish", parent.folder, "--out", tmp_path / "run", "--set", "search.screened=4", "--candidates", 2]
+    words += ["--set", "search.pairs=16", "--set", "budget.generations=3", "--set", "budget.target_certified=-1000"]
+    result = CliRunner().invoke(app, [*map(str, words)])
+    assert result.exit_code == 0, (result.output, result.exception)
+    run = api.open_run(tmp_path / "run")
+    [row] = run.certified.to_dict("records")
+    after = result.stdout.split("certified after polishing:")[1]
+    assert f"return {row['return_mean']:,.2f}" in after
+    assert f"return {run.decisions['return_mean'][0]:,.2f}" not in after
+    assert "try 1 to reach the target (a policy 0.1 standard deviations below it would pass with 5.5 %)" in after
 
 
 def test_with_a_target_set_policies_are_selected_by_success(parent, tmp_path):

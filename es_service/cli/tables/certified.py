@@ -9,7 +9,7 @@ from rich.console import Console
 
 from es_service.cli.console import print_line
 from es_service.errors import counted
-from es_service.runs.certified import Certified
+from es_service.runs.certified import Certified, tries_sentence
 
 
 def print_certified(console: Console, certified: list[Certified]) -> None:
@@ -29,7 +29,8 @@ def certified_line(row: Mapping[str, Any]) -> str:
     chosen = (
         f"first of {row['candidates']:,}" if row["rank"] == 0 else f"number {row['rank'] + 1} of {row['candidates']:,}"
     )
-    return f"{', '.join(parts)}; {counted(row['episodes'], 'episode')}, {chosen} by {row['selected_by']}"
+    tries = f"; {tries_sentence(row['tries'])}" if row["tries"] else ""
+    return f"{', '.join(parts)}; {counted(row['episodes'], 'episode')}, {chosen} by {row['selected_by']}{tries}"
 
 
 def _mean(what: str, row: Mapping[str, Any], name: str) -> str:
