@@ -147,7 +147,10 @@ def curves(
     against: str = "env_steps",
     group_by: Sequence[str] = (),
 ) -> None:
-    """Draw a history column: of one run as a line, of several as the median and quartiles of each group.
+    """Draw a history column: of one run as a line, of several as the median of each group.
+
+    A shaded region is the interval of the median that a comparison page draws, by `bootstrap.median_interval`; a group
+    with one seed, or with several runs of the same seed, has none.
 
     Args:
         against: `generation`, `env_steps` or `wall_clock_s`.
@@ -172,9 +175,9 @@ def curves(
             axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
             continue
         y_R_K = compare.values_at(group, column, against, x_K)
-        low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
-        axes.plot(x_K, median_K, label=group.name, **style)
-        axes.fill_between(x_K, low_K, high_K, color=style["color"], alpha=0.18, linewidth=0)
+        axes.plot(x_K, np.median(y_R_K, axis=0), label=group.name, **style)
+        if (interval_2_K := group.interval(y_R_K)) is not None:
+            axes.fill_between(x_K, *interval_2_K, color=style["color"], alpha=0.18, linewidth=0)
     axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))
     if against == "env_steps":
         axes.xaxis.set_major_formatter(importlib.import_module("matplotlib.ticker").EngFormatter(sep=""))

@@ -21,7 +21,7 @@ GAUGES = {
 OTHERS = {
     "running": "Whether a driver is writing.",
     "readable": "Whether the run can be read.",
-    "certified_fitness": "Mean return of the policy that the newest certification has put first.",
+    "certified_fitness": "Mean fitness, in certified episodes, of the policy that the newest certification put first.",
     "lost_workers": f"Workers lost in the newest {FAULTS_OF} generations.",
     "retries": f"Chunks sent again in the newest {FAULTS_OF} generations.",
 }
@@ -58,8 +58,8 @@ def _values(summary: Summary) -> Mapping[str, float]:
         return numbers
     row = summary.status.row
     numbers["running"] = float(summary.status.driver is not None)
-    if summary.certified is not None:
-        numbers["certified_fitness"] = float(summary.certified.row()["return_mean"])
+    if summary.certified_fitness is not None:
+        numbers["certified_fitness"] = summary.certified_fitness
     if row is not None:
         numbers |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
         try:

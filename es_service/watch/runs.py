@@ -56,6 +56,13 @@ class Summary(NamedTuple):
     problem: str
     """Why it cannot be read; empty if it can."""
 
+    @property
+    def certified_fitness(self) -> float | None:
+        """Mean fitness of the certified policy in its certification episodes; None if there is none."""
+        if self.certified is None or self.status is None:
+            return None
+        return self.certified.episodes.mean_fitness(self.status.run.constants["task.fitness"])
+
 
 class Runs:
     """All runs below some folders."""

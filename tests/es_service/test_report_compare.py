@@ -290,12 +290,29 @@ def test_a_plot_of_a_path_is_the_stored_path(folders, axes):
     )
 
 
+def test_curves_of_figures_and_of_pages_have_the_same_ranges(folders, runs, axes):
+    """Three seeds: the interval of the median reaches from the lowest to the highest, and the quartiles do not."""
+    plots.curves(folders, axes)
+    charts, x_K = compare.charts(compare.grouped(runs), "env_steps")
+    best = next(chart for chart in charts if chart.title == "Best fitness so far")
+    for region, line in zip(axes.collections, best.lines, strict=True):
+        low_K, high_K = line.range_K
+        drawn = {tuple(point) for point in region.get_paths()[0].vertices.tolist()}
+        middle = len(x_K) // 3
+        assert low_K[middle] < high_K[middle]
+        assert {(x_K[middle], low_K[middle]), (x_K[middle], high_K[middle])} <= drawn
+
+
 def test_plots_of_centres_and_curves(folders, runs, axes):
     points = plots.centres(folders[0], axes)
     np.testing.assert_array_equal(points.get_array(), np.sort(runs[0].centres["fitness_mean"]))  # the fittest on top
     axes.clear()
     plots.curves(folders, axes, "coverage")
     assert [line.get_label() for line in axes.lines] == ["me_es", "es"]
+    assert len(axes.collections) == 2
+    axes.clear()
+    plots.curves([folders[0], folders[0], folders[1]], axes)
+    assert not axes.collections, "two runs of one seed do not vary independently"
     axes.clear()
     plots.curves(folders[0], axes, against="generation")
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), runs[0].history["best_fitness"])

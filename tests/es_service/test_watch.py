@@ -17,13 +17,15 @@ from es_service import api
 from es_service.cli.main import app as program
 from es_service.errors import StoreError
 from es_service.report.data import read_run
+from es_service.report.facts import number
 from es_service.report.page import run_sections
 from es_service.report.write import python_call
+from es_service.runs.certification import certify_run
 from es_service.store import connection, upkeep, writer
 from es_service.store.codec import text_sha256
 from es_service.store.lock import acquire_lock
 from es_service.watch import channels
-from es_service.watch.pages import draw_run
+from es_service.watch.pages import draw_list, draw_run
 from es_service.watch.runs import Reading, Runs
 from es_service.watch.server import Site
 from tests.database import database, execute
@@ -347,6 +349,24 @@ def test_metrics_are_the_newest_numbers(tmp_path):
         assert f"es_service_{name}{labels} {float(newest[name])!r}\n" in text
     for name, value in (("generation", 30), ("running", 0), ("readable", 1), ("lost_workers", 1), ("retries", 2)):
         assert f"es_service_{name}{labels} {float(value)!r}\n" in text
+
+
+def test_the_certified_fitness_is_in_the_unit_of_the_fitness_beside_it(tmp_path, workers_here):
+    """With `fitness: final` it is a last reward, here a distance below 3, while the sum of 60 rewards is below -10."""
+    task = SMALL["task"] | {"fitness": "final"}
+    run = api.run(SMALL | {"task": task}, tmp_path / "run").run
+    [certified] = certify_run(run.folder, top=0, episodes=16)
+    row = certified.row()
+    assert row["return_mean"] < -10.0 < row["last_reward_mean"]
+    text = get(site(tmp_path).app(None), "/metrics")[2]
+    [value] = re.findall(r"^es_service_certified_fitness\{.*\} (.*)$", text, re.M)
+    assert float(value) == row["last_reward_mean"]
+    runs = Runs([tmp_path])
+    listed = str(draw_list(runs)().sections["runs"])
+    assert f'data-head="certified">{number(row["last_reward_mean"])}<' in listed
+    [found] = runs.find()
+    page = str(draw_run(runs, found, Reading(found))().sections["what"])
+    assert f"has a mean last reward of {number(row['last_reward_mean'])} (" in page
 
 
 def test_one_picture_is_drawn_for_all_viewers_and_only_what_changed_is_sent(monkeypatch):
