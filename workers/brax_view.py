@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import KEY_WORDS
-from es_service.protocol.options import OptionValue
+from es_service.protocol.options import OptionValue, defaults_of
 from workers.environments import make_environment
 from workers.environments.brax_parts import quietly
 from workers.lanes import task_named
@@ -52,7 +52,7 @@ class TaskBraxEnv(Env):
         """
         chosen = dict(task_options or {})
         self.task: TaskSpec = task_named(task, chosen)
-        options = {name: option.default for name, option in self.task.options.items()} | chosen
+        options = defaults_of(self.task.options) | chosen
         self._backend = str(options.get("backend", "spring"))
         self._functions = lane_functions(make_environment(task, options))
 

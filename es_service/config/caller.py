@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
-from es_service.protocol.options import Option, OptionValue, allowed_value
+from es_service.protocol.options import Option, OptionValue, option_values
 from es_service.protocol.parameters import FREE, ParameterSpec
 
 CALLER = "caller"
@@ -22,10 +22,8 @@ OPTIONS = {
 
 def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
     """Description of the task with these options; those that are left out or not allowed have their defaults."""
-    values = {name: allowed_value(option, options.get(name)) for name, option in OPTIONS.items()}
-    observations, actions, parameters, dimensions, steps = (
-        int(OPTIONS[name].default if value is None else value) for name, value in values.items()
-    )
+    values = option_values(OPTIONS, options)
+    observations, actions, parameters, dimensions, steps = (int(str(value)) for value in values.values())
     names = tuple(f"p{index}" for index in range(parameters))
     return TaskSpec(
         name=CALLER,

@@ -8,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from es_service.protocol.low_rank import MOST_RANK
 from es_service.protocol.messages import Bounds
+from es_service.protocol.options import OptionValue
 
 TASK_OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."
@@ -44,7 +45,7 @@ Share = Annotated[float, Field(gt=0, le=1), "a number above 0, at most 1"]
 Seed = Annotated[int, Field(ge=0, lt=2**63), "a whole number, at least 0 and below 2**63"]
 Switch = Annotated[bool, "true or false"]
 Text = Annotated[str, Field(min_length=1), "text"]
-Options = dict[Text, bool | int | float | str]
+Options = dict[Text, OptionValue]
 """Values of options by name; `config/options.py` checks them against what is declared."""
 Widths = Annotated[
     tuple[Count, ...],

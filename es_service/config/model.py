@@ -14,6 +14,7 @@ from pydantic import Field, PrivateAttr, SerializeAsAny
 from es_service.config.caller import CALLER
 from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
 from es_service.config.fields import (
+    TASK_OPTIONS,
     BoundPairs,
     CellCounts,
     Count,
@@ -216,10 +217,12 @@ class RunConfig(Section):
 
 
 def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested mappings: {"search": {"sigma": 0.02}} -> {"search.sigma": 0.02}."""
+    """Flatten nested mappings: {"search": {"sigma": 0.02}} -> {"search.sigma": 0.02}. An option that is a mapping is a
+    value."""
     values: dict[str, Any] = {}
     for key, value in sections.items():
-        values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        is_group = isinstance(value, Mapping) and prefix != TASK_OPTIONS
+        values |= flat(value, f"{prefix}{key}.") if is_group else {f"{prefix}{key}": value}
     return values
 
 

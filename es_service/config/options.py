@@ -10,7 +10,7 @@ from es_service.config.problems import nearest, one_of, problem_of, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.options import Option, OptionValue, allowed_text, allowed_value
+from es_service.protocol.options import Option, OptionValue, allowed_text, allowed_value, defaults_of, is_plain
 
 
 def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> di
     if isinstance(descriptor, list):
         descriptor = tuple(descriptor)
     is_chosen = descriptor and (isinstance(descriptor, str) or all(type(index) is int for index in descriptor))
-    options = {key: value for key, value in options_of(chosen).items() if isinstance(value, bool | int | float | str)}
+    options = {key: value for key, value in options_of(chosen).items() if is_plain(value)}
     return {"options": options, "descriptor": descriptor if is_chosen else None}
 
 
@@ -40,7 +40,7 @@ def options_of(values: Mapping[str, Any]) -> dict[str, Any]:
 def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:
     """Value of every option that a task declares by its key, and the problems of the given values."""
     declared = task.options
-    options: dict[str, OptionValue] = {f"{TASK_OPTIONS}{name}": option.default for name, option in declared.items()}
+    options = {f"{TASK_OPTIONS}{name}": default for name, default in defaults_of(declared).items()}
     problems = []
     for name, value in options_of(values).items():
         key = f"{TASK_OPTIONS}{name}"

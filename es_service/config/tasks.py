@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -125,7 +126,8 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     answer = json.loads(lines[-1])
     if "problem" in answer:
         problem = answer["problem"]
-        raise ConfigError(problem, field="task.descriptor" if problem.startswith("task.descriptor") else None)
+        named = re.match(r"(task\.(?:descriptor|options\.\w+)) = ", problem)
+        raise ConfigError(problem, field=named and named[1])
     return task_from_fields(answer["task"])
 
 

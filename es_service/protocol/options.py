@@ -15,14 +15,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-OptionValue = bool | int | float | str
+OptionValue = bool | int | float | str | list[Any] | dict[str, Any]
+"""Lists and mappings, of plain values and of their like, are values of options that Gymnasium's environments have."""
 
 
 @dataclass(frozen=True)
 class Option:
     """A setting whose values have the type of its default: bool, int, float or str."""
 
-    default: OptionValue
+    default: OptionValue | None
+    """None, of Gymnasium's environments alone: what the environment has by itself; any plain value is allowed."""
     low: float | None = None
     high: float | None = None
     """Least and greatest value of a number, both allowed; None for no bound."""
@@ -68,8 +70,25 @@ def _problem(name: object, option: object) -> str:
 
 def option_values(options: Mapping[str, Option], given: Mapping[str, object]) -> dict[str, OptionValue]:
     """Values of all options: what is given, as far as it is allowed, and else the defaults."""
-    allowed = {name: allowed_value(option, given.get(name)) for name, option in options.items()}
-    return {name: options[name].default if value is None else value for name, value in allowed.items()}
+    values = defaults_of(options)
+    for name, option in options.items():
+        if (allowed := allowed_value(option, given.get(name))) is not None:
+            values[name] = allowed
+    return values
+
+
+def defaults_of(options: Mapping[str, Option]) -> dict[str, OptionValue]:
+    """The defaults of all options that have one."""
+    return {name: option.default for name, option in options.items() if option.default is not None}
+
+
+def is_plain(value: object) -> bool:
+    """Whether a value is a bool, a finite number, text, or a list or mapping of such values and null."""
+    if isinstance(value, list):
+        return all(item is None or is_plain(item) for item in value)
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and (item is None or is_plain(item)) for key, item in value.items())
+    return isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
 
 
 def allowed_value(option: Option, value: object) -> OptionValue | None:
@@ -78,9 +97,15 @@ def allowed_value(option: Option, value: object) -> OptionValue | None:
     kind = type(option.default)
     if kind is float and type(value) is int and abs(value) < 2**1000:
         value = float(value)
-    if not isinstance(value, bool | int | float | str) or type(value) is not kind:
+    if not isinstance(value, bool | int | float | str | list | dict) or not is_plain(value):
         return None
-    return value if (not option.choices or value in option.choices) and is_within(option, value) else None
+    if option.default is None:
+        return value
+    return (
+        value
+        if type(value) is kind and (not option.choices or value in option.choices) and is_within(option, value)
+        else None
+    )
 
 
 def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = repr) -> str:
@@ -88,8 +113,10 @@ def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = re
     if option.choices:
         *first, last = map(show, option.choices)
         return f"{', '.join(first)} or {last}" if first else last
-    if isinstance(option.default, bool | str):
-        return "true or false" if isinstance(option.default, bool) else "text"
+    if option.default is None:
+        return "true or false, a finite number, text, or a list or mapping of these"
+    if isinstance(option.default, bool | str | list | dict):
+        return {bool: "true or false", str: "text", list: "a list", dict: "a mapping"}[type(option.default)]
     number = "a whole number" if isinstance(option.default, int) else "a number"
     low, high = option.low, option.high
     if low is not None and high is not None:
@@ -98,9 +125,9 @@ def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = re
     return ", ".join([number, *bounds])
 
 
-def is_within(option: Option, value: OptionValue) -> bool:
+def is_within(option: Option, value: OptionValue | None) -> bool:
     """Whether a value is within the bounds of an option and, if it is a number, finite."""
-    if isinstance(value, str):
+    if not isinstance(value, bool | int | float):
         return True
     low, high = -math.inf if option.low is None else option.low, math.inf if option.high is None else option.high
     return low <= value <= high and abs(value) != math.inf

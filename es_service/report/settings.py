@@ -16,6 +16,7 @@ from es_service.config.tasks import ROLLOUTS
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
+from es_service.protocol.options import defaults_of
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.settings import UndeclaredSettings
 
@@ -80,7 +81,7 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
         )
     except ConfigError:
         return {}
-    first = {TASK_OPTIONS + name: option.default for name, option in task.options.items()}
+    first = {TASK_OPTIONS + name: default for name, default in defaults_of(task.options).items()}
     fields = search_fields(method.settings)  # a key of a part's kind that is not the default has a default of its own
     kinds = {key: fields[key].default for key in values.keys() & fields.keys() if not fields[key].is_required()}
     return kinds | plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}

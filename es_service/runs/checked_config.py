@@ -16,6 +16,7 @@ from es_service.config.loading import Source
 from es_service.config.methods import search_fields
 from es_service.config.model import RunConfig
 from es_service.config.tasks import ROLLOUTS, TASKS, task_of
+from es_service.protocol.options import defaults_of
 from es_service.search.algorithms import ALGORITHMS
 
 
@@ -49,7 +50,7 @@ def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[
     """What a config would change of the constants of a run, as `changed_constants` returns it."""
     fields = search_fields(type(config.search))
     defaults = {key: field.default for key, field in fields.items() if not field.is_required()}
-    options = {TASK_OPTIONS + name: option.default for name, option in task_of(config).options.items()}
+    options = {TASK_OPTIONS + name: default for name, default in defaults_of(task_of(config).options).items()}
     return changed_constants(constants, config.constants(), defaults | options)
 
 

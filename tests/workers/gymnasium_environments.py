@@ -29,6 +29,19 @@ class Reach(gymnasium.Env):
         return self.place.reshape(2, 1), -distance, False, self.steps == self.limit, info
 
 
+class Told(Reach):
+    """It has arguments whose defaults are no plain values."""
+
+    def __init__(self, size: int = 2, goal: tuple[float, ...] = (0.5, np.inf), scales: dict | None = None):
+        super().__init__(limit=size + 5)
+        self.goal, self.scales = goal, scales
+
+    def step(self, action):
+        if "here" in self.goal:
+            raise TypeError("must be numbers")
+        return super().step(action)
+
+
 class Words(gymnasium.Env):
     """Its observations are words, and its actions pairs."""
 
@@ -56,6 +69,7 @@ class Still(Unseen):
 gymnasium.register("tests/Unseen-v0", Unseen)
 gymnasium.register("tests/Still-v0", Still)
 gymnasium.register("tests/Reach-v0", Reach, max_episode_steps=25)
+gymnasium.register("tests/Told-v0", Told)
 gymnasium.register("tests/Words-v0", Words)
 gymnasium.register("tests/Pairs-v0", Pairs)
 

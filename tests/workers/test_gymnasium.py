@@ -9,9 +9,11 @@ import pytest
 from es_service import api, load_config
 from es_service.config.model import policy_spec
 from es_service.config.tasks import TASKS, task_of
+from es_service.config.yaml_text import parse_value
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EvaluationChunk
 from es_service.protocol.noise import evaluation_reset_keys
+from es_service.protocol.options import defaults_of
 from es_service.protocol.sources import user_path, user_sources
 from es_service.runs.replay import record
 from es_service.runs.snapshot import Policy
@@ -82,7 +84,7 @@ def test_episodes_are_those_of_a_loop_by_hand(name):
     assert shape.output == ("argmax" if task.discrete_actions else "tanh")
     worker_spec = spec(
         environment=task.name,
-        environment_options={one: option.default for one, option in task.options.items()},
+        environment_options=defaults_of(task.options),
         episode_steps=steps,
         policy=shape,
         rollout="host",
@@ -183,6 +185,70 @@ def test_options_are_arguments_of_make_and_constants_of_the_run(tmp_path):
     assert resumed.digest() == whole.digest()
     with pytest.raises(ConfigError, match=r"cannot be made with the options .*unexpected keyword argument 'reech'"):
         load_config(config_of(REACH, options={"reech": 0.5}))
+
+
+@pytest.mark.slow
+def test_lists_and_mappings_are_arguments_and_keep_their_values(tmp_path):
+    given = {"goal": [0.5, [1, None, "x"]], "scales": {"x": 2.0, "far": {"y": [1]}, "none": {}}}
+    name = f"gymnasium:{MODULE}:tests/Told-v0"
+    config = load_config(config_of(name, options=given))
+    assert config.task.options == {"size": 2, **given}
+    run = api.run(config, tmp_path / "run").run
+    assert run.config["task"]["options"] == config.task.options
+    assert {key: run.constants[f"task.options.{key}"] for key in given} == given
+    assert load_config(parse_value((tmp_path / "run" / "config.yaml").read_text())) == config
+    assert api.resume(tmp_path / "run", ["budget.generations=3"]).run.generation == 3
+    with pytest.raises(ConfigError, match=r"task\.options\.goal: \[0\.5, \[1, null, x\]\] -> \[2\]"):
+        api.resume(tmp_path / "run", ["task.options.goal=[2]"])
+    other = api.fork(
+        tmp_path / "run", ["task.options.scales={z: 1}", "budget.generations=4"], out=tmp_path / "fork"
+    ).run
+    assert other.config["task"]["options"] == {"size": 2, "goal": given["goal"], "scales": {"z": 1}}
+
+
+@pytest.mark.slow
+def test_arguments_whose_defaults_are_no_plain_values_are_known_and_left_to_the_environment():
+    name = f"gymnasium:{MODULE}:tests/Told-v0"
+    task = describe_environment(name)
+    assert {key: option.default for key, option in task.options.items()} == {"size": 2, "goal": None, "scales": None}
+    assert load_config(config_of(name)).task.options == {"size": 2}
+    for wrong, problem in (
+        (
+            {"goal": [float("nan")]},
+            r"task\.options\.goal: \[\.nan\] is not allowed; must be true or false, a finite number",
+        ),
+        ({"gaol": [1.0]}, r"cannot be made with the options \{'gaol': \[1\.0\]\}: TypeError: .*'gaol'"),
+        ({"size": [2]}, r"task\.environment: .* cannot be made with the options \{'size': \[2\]\}: TypeError"),
+        (
+            {"goal": [0.5, "here"]},
+            r"task\.environment: .* cannot do a step with the options .*'here'\]\}: TypeError: must",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            load_config(config_of(name, options=wrong))
+
+
+@pytest.mark.slow
+def test_hopper_has_the_arguments_that_it_has():
+    pytest.importorskip("mujoco")
+    hopper = {"healthy_z_range": [0.7, 2.0], "width": 64}  # the second of them is one of the class that it derives from
+    assert load_config(config_of("gymnasium:Hopper-v5", options=hopper)).task.options.items() >= hopper.items()
+    with pytest.raises(
+        ConfigError, match=r"task\.environment: .* \{'healthy_z_range': \[0\.7\]\}: ValueError: not enough"
+    ):
+        load_config(config_of("gymnasium:Hopper-v5", options={"healthy_z_range": [0.7]}))
+
+
+def test_an_argument_that_a_run_decides_is_refused_with_the_key_that_does():
+    options = {"max_episode_steps": 100, "disable_env_checker": True}
+    with pytest.raises(ConfigError) as caught:
+        load_config(config_of("gymnasium:CartPole-v1", options=options))
+    (problem,) = caught.value.problems
+    assert (problem.field, problem.value) == ("task.options.max_episode_steps", 100)
+    assert (
+        "max_episode_steps = 100: the length of an episode is the key task.episode_steps; set that" in problem.sentence
+    )
+    assert "disable_env_checker = True: the checks that Gymnasium adds to each step are left out" in problem.sentence
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,11 @@ from workers.environments.host_task import (
 
 EPISODE_STEPS = 1000
 """Default length of an episode where the environment has no limit."""
+OURS = {
+    "max_episode_steps": "the length of an episode is the key task.episode_steps; set that instead",
+    "disable_env_checker": "the checks that Gymnasium adds to each step are left out in every run; leave it out",
+}
+"""Arguments of `gymnasium.make` that a run decides, each with what to do instead."""
 
 
 def describe(name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
@@ -63,7 +68,12 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
     made = task.make()
     observations, actions = made.observation_space, made.action_space
     size = int(actions.n) if _is(actions, "Discrete") else int(np.prod(actions.shape))
-    told = try_out(task, size)
+    try:
+        told = try_out(task, size)
+    except TaskError as error:
+        if not options or error.__cause__ is None:
+            raise
+        raise _refused(task.name, "do a step", options, error.__cause__) from error
     steps = spec.max_episode_steps or EPISODE_STEPS
     names, bounds = (LENGTH,), ((0.0, float(steps)),)
     if descriptor is not None:
@@ -88,14 +98,15 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
 def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
     """The environment with the ID `name` as a task of Python objects."""
     gymnasium, spec, task = _gymnasium(), copy.deepcopy(_registered(name)), f"{LIBRARY}:{name}"
+    if wrong := [f"task.options.{key} = {options[key]!r}: {why}" for key, why in OURS.items() if key in options]:
+        raise TaskError("; ".join(wrong))
     spec.order_enforce = False  # a wrapper that would check the order of calls
 
     def construct() -> Any:
         try:
             return gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **options)
         except Exception as error:  # the environment's code can raise anything
-            why = users_error(error, task) or f"{type(error).__name__}: {error}"
-            raise TaskError(f"{task} cannot be made with the options {dict(options)}: {why}") from error
+            raise _refused(task, "be made", options, error) from error
 
     environment = construct()
     size, flat = _observed(task, environment.observation_space)
@@ -109,6 +120,12 @@ def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
         descriptor=length,
         success=said_success,
     )
+
+
+def _refused(task: str, what: str, options: Mapping[str, OptionValue], error: BaseException) -> TaskError:
+    """What an environment raised with the options of a config."""
+    why = users_error(error, task) or f"{type(error).__name__}: {error}"
+    return TaskError(f"{task} cannot {what} with the options {dict(options)}: {why}")
 
 
 def _gymnasium() -> Any:
@@ -195,11 +212,13 @@ def _bounds(space: Any) -> list[tuple[float, float]]:
 
 
 def _options(made: Any, spec: Any, given: Mapping[str, OptionValue]) -> dict[str, Option]:
-    """The keyword arguments that a config can set: those with a plain default, and those that it sets."""
-    parameters = inspect.signature(type(made.unwrapped).__init__).parameters
-    defaults = {name: parameter.default for name, parameter in parameters.items()} | spec.kwargs
-    plain = {name: value for name, value in defaults.items() if type(value) in (bool, int, float, str)}
+    """The keyword arguments that a config can set; those whose default is no plain value, such as a tuple, have none
+    here, and the environment's own unless the config sets them."""
+    parameters = [*inspect.signature(type(made.unwrapped).__init__).parameters.values()][1:]
+    named = [one for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+    defaults = {one.name: one.default for one in named} | spec.kwargs
+    plain = {name: value if type(value) in (bool, int, float, str) else None for name, value in defaults.items()}
     for name, value in given.items():
-        if name not in plain or (type(plain[name]), type(value)) == (int, float):
+        if plain.get(name) is None or (type(plain[name]), type(value)) == (int, float):
             plain[name] = value  # a whole number as a default does not say that others are not allowed
     return {name: Option(value) for name, value in plain.items()}
