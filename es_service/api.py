@@ -15,6 +15,7 @@ from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
+from es_service.protocol.system import given_path
 from es_service.report.progress import in_notebook, show_in_notebook
 from es_service.runs import view
 from es_service.runs.checked_config import changed_config, load_config
@@ -140,7 +141,7 @@ def resume(
 
     overrides, asked = _with_values(overrides)
     listener = _listener(on_generation, on_notice, on_compile, progress, hook)
-    return continue_run(Path(folder), changed, listener, asked, strict=strict)
+    return continue_run(given_path(folder), changed, listener, asked, strict=strict)
 
 
 def run_or_resume(
@@ -161,7 +162,8 @@ def run_or_resume(
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
-    begun = holds_run(Path(out))
+    folder = given_path(out)
+    begun = holds_run(folder)
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
         return run(
@@ -174,7 +176,7 @@ def run_or_resume(
             caller=caller,
         )
     listener = _listener(on_generation, on_notice, on_compile, progress, caller=caller)
-    return continue_run(Path(out), lambda store: wanted, listener)
+    return continue_run(folder, lambda store: wanted, listener)
 
 
 def fork(
@@ -230,7 +232,7 @@ def _text(path: str | os.PathLike[str] | None) -> str | None:
 
 
 def _folder(out: str | os.PathLike[str] | None, config: RunConfig) -> Path:
-    return default_folder(config) if out is None else Path(out)
+    return default_folder(config) if out is None else given_path(out)
 
 
 def default_folder(config: RunConfig, which: str = "") -> Path:

@@ -30,6 +30,7 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
 from es_service.protocol.parent import require_same_process
+from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
 from es_service.runs.session import CallerLeft, OnNotice, Outcome, warn
 from es_service.runs.view import Run, open_run
@@ -274,7 +275,7 @@ def ask_tell(
     Raises:
         ConfigError: the config is wrong, its task is not `caller`, or the folder's run has other constants.
     """
-    folder = Path(out)
+    folder = given_path(out)
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not holds_run(folder))
     if wanted.task.environment != CALLER:
         raise ConfigError(

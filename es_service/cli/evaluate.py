@@ -15,6 +15,7 @@ from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, place_of, print_note
 from es_service.cli.several import RunsArgument, is_single, items_of_each, of_each, readable
 from es_service.errors import ConfigError
+from es_service.protocol.system import given_path
 from es_service.report.progress import print_notice
 
 
@@ -57,7 +58,9 @@ def evaluate(
         ),
     ] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", parser=given_path, help="Also write the rows to this CSV file.")
+    ] = None,
     as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:

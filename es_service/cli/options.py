@@ -21,14 +21,19 @@ from es_service.config.tasks import ROLLOUTS, TASKS, task_of
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
+from es_service.protocol.system import given_path
 from es_service.search.algorithms import ALGORITHMS
 
-ConfigArgument = Annotated[Path, typer.Argument(help="YAML file, or the name of a shipped config.", show_default=False)]
-RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
+ConfigArgument = Annotated[
+    Path, typer.Argument(parser=given_path, help="YAML file, or the name of a shipped config.", show_default=False)
+]
+RunArgument = Annotated[Path, typer.Argument(parser=given_path, help="Folder of a run.", show_default=False)]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a new one under runs/.")]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", parser=given_path, help="Folder of the new run; default: a new one under runs/.")
+]
 OrResumeOption = Annotated[
     bool, typer.Option("--or-resume", help="Resume the run if the --out folder already holds it.")
 ]

@@ -13,6 +13,7 @@ from es_service.cli.commands import evaluation_of
 from es_service.cli.options import RunArgument, place_of, print_note
 from es_service.cli.several import RunsArgument, is_single, of_each, readable
 from es_service.errors import ConfigError
+from es_service.protocol.system import given_path
 
 if TYPE_CHECKING:  # importing it takes time that other commands need not spend
     from es_service.report.data import RunData
@@ -22,7 +23,9 @@ def report(
     folders: RunsArgument,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="File to write; default for one run or sweep: report.html in its folder."),
+        typer.Option(
+            "--out", parser=given_path, help="File to write; default for one run or sweep: report.html in its folder."
+        ),
     ] = None,
     replay: Annotated[
         list[str] | None,
@@ -42,7 +45,8 @@ def report(
         typer.Option("--threshold", help="Fitness from which a compared run is solved; default: its target fitness."),
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option("--figures", metavar="DIR", help="Also write each figure as SVG and PNG.")
+        Path | None,
+        typer.Option("--figures", parser=given_path, metavar="DIR", help="Also write each figure as SVG and PNG."),
     ] = None,
 ) -> None:
     """Write a page about a run: its curves, its map, its policies; or one that compares several runs, or a sweep."""
@@ -106,7 +110,9 @@ def export(
     to: Annotated[
         str, typer.Option("--to", help="Format: csv, parquet, npz, ribs or tensorboard.", show_default=False)
     ],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", parser=given_path, help="Folder to write into; default: RUN/export.")
+    ] = None,
 ) -> None:
     """Write history, novelty archive and behaviour map as tables, the policies as arrays, or the history as events."""
     from es_service.runs.export import export as write

@@ -12,11 +12,13 @@ import typer
 from es_service.cli.commands import error_message
 from es_service.cli.options import print_error, print_note
 from es_service.errors import ServiceError
+from es_service.protocol.system import given_path
 from es_service.runs.folders import runs_of
 from es_service.store.folder import holds_run
 
 RunsArgument = Annotated[
-    list[Path], typer.Argument(metavar="RUN...", help="Folders of runs or of sweeps.", show_default=False)
+    list[Path],
+    typer.Argument(parser=given_path, metavar="RUN...", help="Folders of runs or of sweeps.", show_default=False),
 ]
 T = TypeVar("T")
 

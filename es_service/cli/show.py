@@ -18,6 +18,7 @@ from es_service.cli.tables.status import follow_status, print_status
 from es_service.config.shipped import shipped_text
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError, ServiceError
+from es_service.protocol.system import given_path
 from es_service.runs.folders import runs_of
 from es_service.runs.run_status import newest_runs, read_status
 from es_service.store import digest
@@ -27,6 +28,7 @@ def status(
     folders: Annotated[
         list[Path] | None,
         typer.Argument(
+            parser=given_path,
             metavar="[RUN]...",
             help="Folders of runs or of sweeps; default: the newest runs under runs/.",
             show_default=False,

@@ -28,6 +28,7 @@ from es_service.cli.tables.sweep import show_sweep
 from es_service.config.keys import parse_overrides
 from es_service.config.yaml_text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
+from es_service.protocol.system import given_path
 from es_service.runs.sweep import SweptRun, run_planned
 from es_service.runs.sweep_plan import plan
 from es_service.runs.trackers import check_trackers
@@ -48,7 +49,10 @@ ParallelOption = Annotated[
 
 def sweep(
     config: ConfigArgument,
-    out: Annotated[Path, typer.Option("--out", help="Folder, in which each run gets a folder.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option("--out", parser=given_path, help="Folder, in which each run gets a folder.", show_default=False),
+    ],
     grid: GridOption = None,
     seeds: SeedsOption = None,
     set_: SetOption = None,

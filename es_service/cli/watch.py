@@ -10,11 +10,15 @@ import typer
 from es_service.cli.commands import evaluation_of
 from es_service.cli.options import print_note
 from es_service.errors import ConfigError, WayOut
+from es_service.protocol.system import given_path
 
 
 def watch(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER...", help="Folders with runs below them.", show_default=False)
+        list[Path],
+        typer.Argument(
+            parser=given_path, metavar="FOLDER...", help="Folders with runs below them.", show_default=False
+        ),
     ],
     host: Annotated[
         str, typer.Option("--host", help="Address to listen on; another than this machine's own needs a token.")

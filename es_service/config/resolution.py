@@ -26,6 +26,7 @@ from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS, PolicySpec
 from es_service.protocol.rollouts import CHUNK_PAIRS, Rollouts, choose, why_not
+from es_service.protocol.system import given_path
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
@@ -165,7 +166,7 @@ def resolve(
             values["compute.gradient_block_pairs"] = default_gradient_block_pairs(pairs, chunk_pairs, parameters)
     if isinstance(values.get("search.init_from"), str):
         # An absolute path, so that the stored config names the same run from every working directory.
-        values["search.init_from"] = os.path.abspath(os.path.expanduser(values["search.init_from"]))
+        values["search.init_from"] = os.path.abspath(given_path(values["search.init_from"]))
     return values
 
 

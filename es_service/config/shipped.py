@@ -9,6 +9,7 @@ from pathlib import Path
 from es_service.config.problems import did_you_mean, nearest
 from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import ConfigError, Problem
+from es_service.protocol.system import given_path
 
 PACKAGE = Path(__file__).parents[1]
 PLACES = (PACKAGE.parent / "configs", PACKAGE / "shipped_configs")
@@ -33,7 +34,7 @@ def first_sentence(text: str) -> str:
 
 def config_file(source: str | os.PathLike[str]) -> Path:
     """The file at a path or, if it does not exist, the file of the shipped config with this name."""
-    path = Path(source)
+    path = given_path(source)
     if path.exists() or path.name != os.fspath(source):
         return path
     return shipped_configs().get(path.name.removesuffix(".yaml"), path)

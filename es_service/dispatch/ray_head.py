@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from es_service.errors import StartError, WayOut
+from es_service.protocol.system import given_path
 
 HEAD_CALL = "/ray.rpc.NodeInfoGcsService/CheckAlive"
 """A call of Ray's protocol to its head that changes nothing and takes an empty message."""
@@ -122,7 +123,7 @@ def _token(is_auto: bool) -> tuple[str | None, str]:
         return given.strip(), "RAY_AUTH_TOKEN"
     path = os.environ.get("RAY_AUTH_TOKEN_PATH") or "~/.ray/auth_token"
     try:
-        return Path(path).expanduser().read_text().strip(), path
+        return given_path(path).read_text().strip(), path
     except OSError:
         return None, f"there is none in RAY_AUTH_TOKEN or {path}"
 

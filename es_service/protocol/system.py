@@ -18,6 +18,12 @@ from functools import cache
 from pathlib import Path
 
 
+def given_path(path: str | os.PathLike[str]) -> Path:
+    """The path that a person or a caller means: a leading `~` or `~user` is a home folder, as in a shell. A file of
+    this name is `./~`."""
+    return Path(os.path.expanduser(path))
+
+
 def usable_cpus() -> int:
     """CPUs that this process may run on: its affinity, or all of the machine where there is none (macOS)."""
     if hasattr(os, "sched_getaffinity"):

@@ -11,12 +11,12 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from es_service.errors import ConfigError, NotInRunError
+from es_service.protocol.system import given_path
 from es_service.report import compare
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
@@ -190,7 +190,7 @@ def curves(
 def _data(run: Source) -> RunData:
     if isinstance(run, RunData):
         return run
-    return read_run(run.folder if isinstance(run, Run) else Path(run), paths=False, digest=False)
+    return read_run(run.folder if isinstance(run, Run) else given_path(run), paths=False, digest=False)
 
 
 def _bars(data: RunData) -> list[list[tuple[float, float]]]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.protocol.system import given_path
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
 from es_service.report.figures import empty_figure, write_figures
@@ -56,7 +57,7 @@ def write_report(
         ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty, or
             no policy is certified. StoreError: the run cannot be read, or the file cannot be written.
     """
-    folder = Path(folder)
+    folder = given_path(folder)
     if len(cells) > MOST_CELLS:
         raise ConfigError(
             f"{len(cells)} cells are too many for replays in one page; choose at most {MOST_CELLS}",
@@ -73,10 +74,10 @@ def write_report(
     replays = replay_section(data, best=best, cells=cells, certified=certified, trusted=trusted) if has_replay else None
     elsewhere = WayOut("report", "write it elsewhere", str(folder), out="FILE")
     page = run_page(data, evaluate or python_call(folder), replays)
-    page = write_page(page, Path(out or folder / REPORT), [elsewhere])
+    page = write_page(page, given_path(out or folder / REPORT), [elsewhere])
     if figures is None or not data.history["generation"].size:
         return [page]
-    return [page, *write_figures([data], Path(figures))]
+    return [page, *write_figures([data], given_path(figures))]
 
 
 def write_comparison(
@@ -100,10 +101,10 @@ def write_comparison(
     """
     if figures is not None:
         empty_figure()  # a missing matplotlib is reported before anything is read
-    read = (run if isinstance(run, RunData) else read_compared(Path(run)) for run in folders)
+    read = (run if isinstance(run, RunData) else read_compared(given_path(run)) for run in folders)
     different = list({run.folder.resolve(): run for run in read}.values())  # a run that is given twice counts once
-    page = write_page(comparison_page(different, group_by, threshold), Path(out))
-    return [page, *(write_figures(different, Path(figures), group_by, threshold) if figures is not None else [])]
+    page = write_page(comparison_page(different, group_by, threshold), given_path(out))
+    return [page, *(write_figures(different, given_path(figures), group_by, threshold) if figures is not None else [])]
 
 
 def read_compared(folder: Path) -> RunData:

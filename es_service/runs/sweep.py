@@ -26,6 +26,7 @@ from es_service.loop.budget import limits_of, spent
 from es_service.loop.history import Row
 from es_service.protocol.parent import bound
 from es_service.protocol.process_environment import same_imports
+from es_service.protocol.system import given_path
 from es_service.runs.certified import target_reached
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
@@ -99,7 +100,8 @@ def sweep(
             the folder cannot be used, or another sweep is running in it. EvaluationError: the cluster cannot be
             reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
     """
-    return run_planned(plan(config, Path(out), grid, seeds, overrides), Path(out), parallel, on_progress)
+    folder = given_path(out)
+    return run_planned(plan(config, folder, grid, seeds, overrides), folder, parallel, on_progress)
 
 
 def run_planned(

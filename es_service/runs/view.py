@@ -17,6 +17,7 @@ from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, Parts, elite_part
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
+from es_service.protocol.system import given_path
 from es_service.runs.certified import all_certifications, certified_policies, newest_certified
 from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -310,6 +311,6 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
     Raises:
         StoreError: not a run folder, or written by a newer version.
     """
-    run = Run(Path(folder))
+    run = Run(given_path(folder))
     _ = run.meta  # fail here, not at the first access
     return run
