@@ -20,11 +20,11 @@ from typing import IO, Literal
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
-from es_service.errors import Interrupted, RunLockedError, StoreError, counted
+from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, spent
 from es_service.loop.history import Row
-from es_service.protocol.parent import bound
+from es_service.protocol.parent import bound, require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.system import given_path
 from es_service.runs.certified import target_reached
@@ -130,9 +130,10 @@ def run_planned(
             todo = f"{len(left)} of {counted(len(runs), 'run')} to do in {out}, {shares.at_once} at a time"
             on_notice(f"{todo}; workers of each: {' or '.join(dict.fromkeys(map(str, shares.workers)))}")
         running: dict[str, _Child] = {}
-        shown, read_s = None, float("-inf")
+        shown, read_s, maker = None, float("-inf"), os.getpid()
         try:
             while shown is None or waiting or running:
+                require_same_process(maker, "a sweep", "end this one: the sweep goes on in the other")
                 if (number := should_stop()) is not None:
                     raise Interrupted(number)
                 for name in [name for name, child in running.items() if child.process.poll() is not None]:
@@ -146,6 +147,8 @@ def run_planned(
                     on_progress(shown := now)
                 if running:
                     time.sleep(POLL_S)
+        except ForkedError:
+            raise  # the runs go on
         except BaseException:
             _stop(runs, running, configs)
             with suppress(Exception):
