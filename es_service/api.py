@@ -91,7 +91,7 @@ def run(
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.
-        on_compile: called with a sentence when the workers compile for more than two seconds.
+        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
         caller: for `ask_tell`, which computes the episodes of a task that has none of its own.
 

@@ -164,7 +164,7 @@ ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py
 BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
-ENGINE = "es_service/dispatch/engine.py"
+ENGINE, DEADLINES = "es_service/dispatch/engine.py", "es_service/dispatch/deadlines.py"
 EPISODE, WORKER = "workers/episode.py", "workers/worker.py"
 RESULTS, POLICY = "workers/results.py", "workers/policies/policy.py"
 XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
@@ -348,6 +348,13 @@ CASES = [
         OF_SCHEDULER,
         ("is reversed", SCHEDULER, "for slot in reversed(slots):", "for slot in slots:"),
         ("puts them last", CHANGES, "s.places[0][0] - 1 if s.places else 0", "s.places[-1][0] + 1 if s.places else 0"),
+    ),
+    *cases(
+        "a deadline follows progress",
+        OF_SCHEDULER,
+        ("not at all", DEADLINES, "deadline_s=max(record.allowed_s, until_s)", "deadline_s=record.allowed_s"),
+        ("for ever", DEADLINES, "deadline_s=max(record.allowed_s, until_s)", "deadline_s=math.inf"),
+        ("attempts are alike", DEADLINES, "2 ** min(worker.slots[0].attempt - 1, MOST_DOUBLINGS)", "1"),
     ),
     *cases(
         "the item that loses workers is charged where items overlap",

@@ -17,6 +17,7 @@ from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
 from es_service.protocol.raised import sendable
 from es_service.protocol.sources import OtherCodeError, why_refused
+from workers import progress
 from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # they import JAX, whose settings are made here
@@ -52,6 +53,10 @@ class WorkerActor:
         import ray
 
         return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id())
+
+    def progress(self) -> progress.Seen:
+        """How far it is with the oldest of its calls; answered while they run, so that the engine can ask it."""
+        return progress.seen()
 
     def build(self) -> str:
         """Import JAX with the settings of all workers and build the run's functions; returns the platform's text.

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,6 +21,7 @@ from es_service.protocol.kept_parents import with_made_policies
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import sendable
+from workers import progress
 from workers.compilable import Compilable
 from workers.rollouts import BACKENDS
 from workers.worker import make_worker
@@ -55,13 +57,19 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
         worker, pool = make_worker(spec), ThreadPoolExecutor(cores)
         return Compilable(lambda work: divided(pool, worker.run, work, cores), worker.compile)
     context = get_context("spawn")  # a forked JAX would not work
-    given = (spec, os.getpid(), context.Barrier(cores))
+    given = (spec, os.getpid(), context.Barrier(cores), progress.shared_rows(context, cores))
     pool = ProcessPoolExecutor(cores, context, _begin_child, given)
     _together(pool, _meet, [()] * cores)  # from now on there is a child for each core
-    return Compilable(
-        lambda work: divided(pool, _run_child, with_made_policies(work), cores),
-        lambda work: _together(pool, _compile_in_child, [(with_made_policies(work),)] * cores),
-    )
+
+    def run(work: Sequence[Work]) -> list[ChunkResult]:
+        with progress.call() as call:
+            return divided(pool, partial(_run_child, call), with_made_policies(work), cores)
+
+    def compile_in_children(work: Sequence[Work]) -> None:
+        with progress.call() as call:
+            _together(pool, _compile_in_child, [(call, with_made_policies(work))] * cores)
+
+    return Compilable(run, compile_in_children)
 
 
 def divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:
@@ -91,10 +99,11 @@ def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
     return [work[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _begin_child(spec: WorkerSpec, parent: int, barrier: Any) -> None:
+def _begin_child(spec: WorkerSpec, parent: int, barrier: Any, rows: tuple[Any, Any]) -> None:
     """Prepare a child process, which ends with its parent."""
     global _child
     end_with(parent)
+    progress.use_row(*rows)
     _child = _Child(make_worker(spec), spec.task_code, barrier)
 
 
@@ -104,8 +113,9 @@ def _meet() -> None:
     _child.barrier.wait()
 
 
-def _compile_in_child(work: Sequence[Work]) -> None:
+def _compile_in_child(call: int, work: Sequence[Work]) -> None:
     assert _child is not None, "the pool initialises each child"
+    progress.belongs_to(call)
     try:
         with sendable(*_child.task_code):
             _child.worker.compile(work)
@@ -113,7 +123,8 @@ def _compile_in_child(work: Sequence[Work]) -> None:
         _meet()
 
 
-def _run_child(work: Sequence[Work]) -> list[ChunkResult]:
+def _run_child(call: int, work: Sequence[Work]) -> list[ChunkResult]:
     assert _child is not None, "the pool initialises each child"
+    progress.belongs_to(call)
     with sendable(*_child.task_code):
         return _child.worker(work)

@@ -35,6 +35,7 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import POLICIES_TOGETHER, slots
+from workers import progress
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
@@ -86,7 +87,11 @@ def make_worker(spec: WorkerSpec) -> Compilable:
         ]  # to find which chunk raises
 
     def run(work: Sequence[Work]) -> list[ChunkResult]:
-        return with_neighbours_added(work, [result for group in groups(work) for result in named(run_group, group)])
+        results: list[ChunkResult] = []
+        for group in groups(work):
+            results += named(run_group, group)
+            progress.moved()
+        return with_neighbours_added(work, results)
 
     return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 

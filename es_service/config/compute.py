@@ -82,7 +82,8 @@ class ComputeConfig(Section):
     )
     chunk_timeout_s: Positive = Field(
         30.0,
-        description="Shortest deadline of a chunk in seconds; slow chunks make the deadline of later chunks longer.",
+        description="Shortest deadline of a chunk in seconds; slow chunks make the deadline of later chunks longer, "
+        "and each attempt may take twice as long as the one before. It counts anew whenever a worker reports progress.",
     )
     first_chunk_timeout_s: Positive = Field(
         120.0,
@@ -91,7 +92,8 @@ class ComputeConfig(Section):
     )
     compile_timeout_s: Positive = Field(
         120.0,
-        description="Deadline in seconds for the compilation that a worker does before its first chunk of each kind.",
+        description="Deadline in seconds for the compilation that a worker does before its first chunk of each kind; "
+        "for a task of Python objects, longest time in which one of them must be made or reset.",
     )
     max_attempts: Count = Field(4, description="Attempts to compute a chunk before the run stops with its error.")
     place_timeout_s: Positive | None = Field(

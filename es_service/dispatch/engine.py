@@ -61,6 +61,7 @@ Message = (
     | events.WorkerUp
     | events.WorkerLost
     | events.Compiled
+    | events.Progress
     | events.Failure
     | events.Drain
     | events.SetWorkers
@@ -151,7 +152,7 @@ class Engine(Generic[AnyTransport]):
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
         on_wait: Callable[[str], None] = lambda shortage: None,
-        on_compile: Callable[[str], None] = lambda kind: None,
+        on_compile: Callable[[str, str], None] = lambda kind, text: None,
     ) -> None:
         """Start `limits.workers` workers. If this raises, which the log can cause, the transport is closed.
 

@@ -44,7 +44,7 @@ class Limits:
     start_timeout_s: float = 120.0
     """Longest time in which a worker must come up, counted again from when it has a place."""
     compile_timeout_s: float = 600.0
-    """Longest time in which a worker must compile for its first item of a kind."""
+    """Longest time in which a worker must compile for its first item of a kind, or make or reset one environment."""
     first_chunk_timeout_s: float = 600.0
     """Longest time for an item while no duration of its kind is known, without the time of compiling. If
     `chunk_timeout_s` is longer, that limit applies."""
@@ -54,9 +54,10 @@ class Limits:
     late_by_s: float = 0.03
     """Least time by which a late item exceeds its usual duration, since a copy of a very short item saves nothing."""
     chunk_timeout_s: float = 30.0
-    """Lower bound of the limit for later items."""
+    """Lower bound of the limit for later items, and longest time without progress of a worker that reports it."""
     deadline_factor: float = 5.0
-    """Later items may take max(chunk_timeout_s, deadline_factor x size x median of recent durations of their kind)."""
+    """Later items may take max(chunk_timeout_s, deadline_factor x size x median of recent durations of their kind), in
+    their first attempt; any item may take twice as long in each attempt as in the one before."""
     time_limit_s: float | None = None
     """Longest time for a chunk of episodes, in the place of the limits for first and later items; None: these."""
     episodes_together: int | None = None
@@ -152,6 +153,23 @@ class Compiled:
 
 
 @dataclass(frozen=True)
+class Progress:
+    """A worker has done more of what it does first: of its start, or of the first of its work items."""
+
+    worker: int
+    doing: str = ""
+    """What it does with environments before their first step, "making" or "resetting"; empty while it computes."""
+    done: int = 0
+    """Environments with which it has done so,"""
+    total: int = 0
+    """of this number."""
+
+    def __str__(self) -> str:
+        environments = "environment" if self.total == 1 else "environments"
+        return f"{self.doing} {self.total} {environments}: {self.done} of {self.total}"
+
+
+@dataclass(frozen=True)
 class Result:
     """A worker has answered a work item. The engine keeps the result if the scheduler commands `Deliver`, else
     drops it."""
@@ -197,7 +215,7 @@ class SetWorkers:
     workers: int
 
 
-Event = Submit | Placed | WorkerUp | WorkerLost | Compiled | Result | Failure | Tick | Drain | SetWorkers
+Event = Submit | Placed | WorkerUp | WorkerLost | Compiled | Progress | Result | Failure | Tick | Drain | SetWorkers
 
 
 # Commands, which an engine must carry out in the order given.

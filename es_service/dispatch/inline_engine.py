@@ -25,7 +25,16 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.events import (
+    Compiled,
+    Failure,
+    Limits,
+    Placed,
+    Progress,
+    WorkerLost,
+    WorkerUp,
+    with_last_words,
+)
 from es_service.dispatch.gpus import places
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
@@ -50,7 +59,7 @@ def inline_engine(
     threads: bool = False,
     gpus: float = 0.0,
     log: Log = no_log,
-    on_compile: Callable[[str], None] = lambda kind: None,
+    on_compile: Callable[[str, str], None] = lambda kind, text: None,
 ) -> Engine[ChildProcesses]:
     """Engine with `limits.workers` workers on this machine, which are starting.
 
@@ -236,6 +245,8 @@ class ChildProcesses:
                         self._ready.append(WorkerUp(number))
                     case ("compiled", kind, seconds):
                         self._ready.append(Compiled(number, kind, seconds))
+                    case ("progress", doing, done, total):
+                        self._ready.append(Progress(number, doing, done, total))
                     case ("results", item_id, attempt, results):
                         worker.unanswered.pop((item_id, attempt), None)
                         worker.lacking.discard((item_id, attempt))

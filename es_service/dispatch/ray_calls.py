@@ -10,6 +10,7 @@ from operator import itemgetter
 from types import ModuleType
 from typing import Any
 
+from es_service.dispatch.events import Progress
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce, forget_old_subjects
 from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
@@ -18,6 +19,10 @@ from es_service.protocol.recipes import Origin
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of a subject or of a parent of policies that is sent with every call; a larger one is stored,
 and fetched once per node."""
+LOOKS = "looks"
+"""Concurrency group of actors in which they answer how far they are."""
+LOOK_S = 1.0
+"""Seconds between two looks at which actors are asked so. A call that is answered between them costs no question."""
 MANY = 64
 """Number of workers above which all answers that are there are looked for at once, since Ray looks at every call."""
 
@@ -61,7 +66,7 @@ class Calls(dict[Any, Call]):
                 return ref
         if not self:
             return None
-        refs = list(self._oldest().values())
+        refs = list(self.oldest().values())
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready and len(refs) > MANY:
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0.0)
@@ -70,14 +75,57 @@ class Calls(dict[Any, Call]):
 
     def owed_first(self) -> dict[int, str]:
         """Worker -> method of its oldest call."""
-        return {worker: self[ref].what for worker, ref in self._oldest().items()}
+        return {worker: self[ref].what for worker, ref in self.oldest().items()}
 
-    def _oldest(self) -> dict[int, Any]:
+    def oldest(self) -> dict[int, Any]:
         """Worker -> reference to the answer of its oldest call."""
         oldest: dict[int, Any] = {}
         for ref, call in self.items():
             oldest.setdefault(call.worker, ref)
         return oldest
+
+
+class Looks:
+    """Questions to actors how far they are with their oldest calls, which they answer in a thread of its own."""
+
+    def __init__(self, ray: ModuleType) -> None:
+        self._ray = ray
+        self._oldest: Mapping[int, Any] = {}
+        self._asked: dict[Any, tuple[int, Any]] = {}
+        """Reference to an answer -> the worker, and its oldest call when it was asked."""
+        self._shown: dict[int, tuple[Any, Any]] = {}
+        """Worker -> that call, and what the last answer showed."""
+
+    def look(self, oldest: Mapping[int, Any], handles: Mapping[int, Any]) -> list[Progress]:
+        """Ask each actor with the same oldest call as at the last look; returns what has come of earlier questions: the
+        reports of those that have done more than at the answer before.
+
+        Args:
+            oldest: worker -> reference to the answer of its oldest call.
+            handles: worker -> actor.
+        """
+        asked = list(self._asked)
+        ready, _ = self._ray.wait(asked, num_returns=len(asked), timeout=0.0) if asked else ([], [])
+        found = [report for ref in ready if (report := self._report(ref, *self._asked.pop(ref), oldest)) is not None]
+        owing = {worker for worker, _ in self._asked.values()}
+        for worker, call in oldest.items():
+            if self._oldest.get(worker) == call and worker not in owing:
+                answer = handles[worker].progress.options(concurrency_group=LOOKS).remote()
+                self._asked[answer] = worker, call
+        self._oldest = oldest
+        self._shown = {worker: shown for worker, shown in self._shown.items() if oldest.get(worker) == shown[0]}
+        return found
+
+    def _report(self, ref: Any, worker: int, call: Any, oldest: Mapping[int, Any]) -> Progress | None:
+        """The report of an answer, if it shows more of a call than the one before."""
+        try:
+            moves, *rest = self._ray.get(ref)
+        except self._ray.exceptions.RayError:  # it is lost, which its call shows
+            return None
+        before, self._shown[worker] = self._shown.get(worker), (call, moves)
+        if oldest.get(worker) != call or before in (None, (call, moves)) or before[0] != call:
+            return None
+        return Progress(worker, *rest)
 
 
 class Arguments:

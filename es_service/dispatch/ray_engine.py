@@ -22,7 +22,7 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_calls import Arguments, Call, Calls
+from es_service.dispatch.ray_calls import LOOK_S, LOOKS, Arguments, Call, Calls, Looks
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
@@ -47,7 +47,7 @@ def ray_engine(
     grows: bool = False,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
-    on_compile: Callable[[str], None] = lambda kind: None,
+    on_compile: Callable[[str, str], None] = lambda kind, text: None,
     on_refusal: Callable[[str], None] = lambda refusal: None,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
@@ -114,10 +114,11 @@ class Actors:
         self._ray = ray
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
         options = {"num_cpus": claim.cpus, "num_gpus": claim.gpus, "max_restarts": 0, "max_task_retries": 0}
-        self._class = ray.remote(**options, max_concurrency=items_at_once)(actor)
+        self._class = ray.remote(**options, max_concurrency=items_at_once, concurrency_groups={LOOKS: 1})(actor)
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls, self._arguments = Calls(ray), Arguments(ray)
+        self._looks, self._look_s = Looks(ray), time.monotonic() + LOOK_S
         self._places: dict[int, WorkerPlace] = {}
         self._planned: dict[int, str] = {}
         """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
@@ -214,6 +215,9 @@ class Actors:
             self._follow(self._watch)
         if self._refusals and not self._up:
             self._refusals.check(None if self._watch is None else self._watch.latest())
+        if (now := time.monotonic()) >= self._look_s:
+            self._look_s = now + LOOK_S
+            self._inbox += self._looks.look(self._calls.oldest(), self._handles)
         if self._inbox:
             return self._inbox.popleft()
         if not self._calls:

@@ -34,7 +34,15 @@ import math
 from collections.abc import Hashable
 
 from es_service.dispatch.assignment import assign
-from es_service.dispatch.deadlines import RECENT_DURATIONS, begin_first_slot, missed_deadline, note_compiled, plain
+from es_service.dispatch.deadlines import (
+    RECENT_DURATIONS,
+    begin_first_slot,
+    missed_deadline,
+    note_compiled,
+    note_progress,
+    plain,
+    start_deadline,
+)
 from es_service.dispatch.events import (
     Command,
     Compiled,
@@ -44,6 +52,7 @@ from es_service.dispatch.events import (
     Fail,
     Failure,
     Placed,
+    Progress,
     Result,
     SetWorkers,
     StartWorker,
@@ -94,8 +103,7 @@ def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:
             append_items(s, items)
         case Placed(worker):
             if (record := s.starting.get(worker)) is not None:
-                deadline_s = now + s.limits.start_timeout_s
-                put_worker(s, s.starting, worker, record._replace(deadline_s=deadline_s, placed=True))
+                put_worker(s, s.starting, worker, start_deadline(s, record._replace(placed=True), now))
         case WorkerUp(worker):
             if pop_worker(s, s.starting, worker) is not None:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
@@ -106,6 +114,8 @@ def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:
             _lose(s, out, worker, reason, now, fault=fault, charge=charge_item)
         case Compiled():
             note_compiled(s, event, now)
+        case Progress():
+            note_progress(s, event, now)
         case Failure():
             _failure(s, out, event, now)
         case Tick(silent):
@@ -247,7 +257,7 @@ def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, what: str,
 def _fail(s: SchedulerState, out: list[Command], message: str) -> None:
     out.append(Fail(message))
     out.extend(StopWorker(worker, "the run failed") for worker in sorted([*s.starting, *s.up, *s.draining]))
-    for container in (s.starting, s.up, s.draining, s.deadlines, s.free, s.places):
+    for container in (s.starting, s.up, s.draining, s.deadlines, s.preparing, s.free, s.places):
         container.clear()
     s.failed = message
 
@@ -282,6 +292,6 @@ def _start_workers(s: SchedulerState, out: list[Command], now: float) -> None:
     if missing <= 0 or now < s.start_at_s:
         return
     for worker in range(s.next_worker, s.next_worker + missing):
-        put_worker(s, s.starting, worker, Worker(worker, deadline_s=now + s.limits.start_timeout_s))
+        put_worker(s, s.starting, worker, start_deadline(s, Worker(worker), now))
         out.append(StartWorker(worker))
     s.next_worker += missing

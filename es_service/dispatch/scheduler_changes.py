@@ -14,7 +14,7 @@ from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, Waiting
 
 
 def put_worker(s: SchedulerState, group: dict[int, Worker], worker: int, record: Worker) -> None:
-    """Store a worker in one of the three groups of `s`; `deadlines`, `free`, `in_time` and `late` change with it."""
+    """Store a worker in one of the three groups of `s`; the other containers that depend on it change with it."""
     old = group.get(worker)
     group[worker] = record
     old_s, new_s = math.inf if old is None else next_time(old), next_time(record)
@@ -23,6 +23,10 @@ def put_worker(s: SchedulerState, group: dict[int, Worker], worker: int, record:
             s.deadlines.remove((old_s, worker))
         if new_s < math.inf:
             s.deadlines.add((new_s, worker))
+    if record.preparing is not None:
+        s.preparing[worker] = record.preparing
+    elif old is not None and old.preparing is not None:
+        del s.preparing[worker]
     if group is s.up and (old is None or len(old.slots) != len(record.slots) or old.pace != record.pace):
         if old is not None:
             _forget_free(s, worker, old)
@@ -42,6 +46,7 @@ def pop_worker(s: SchedulerState, group: dict[int, Worker], worker: int) -> Work
     if old is not None:
         if (at_s := next_time(old)) < math.inf:
             s.deadlines.remove((at_s, worker))
+        s.preparing.pop(worker, None)
         if group is s.up:
             _forget_free(s, worker, old)
             s.in_time -= old.pace == IN_TIME

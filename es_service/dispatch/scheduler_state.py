@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from sortedcontainers import SortedList
 
-from es_service.dispatch.events import Limits, WorkItem, because, with_last_words
+from es_service.dispatch.events import Limits, Progress, WorkItem, because, with_last_words
 
 IN_TIME, LATE, NEW = range(3)
 """Values of `Worker.pace`, best first."""
@@ -54,7 +54,13 @@ class Worker(NamedTuple):
     started_s: float = 0.0
     """Time at which it began the first slot, or ended compiling for it."""
     deadline_s: float = math.inf
-    """Time by which it must come up, or have compiled for the first slot, or answer it."""
+    """Time by which it must come up, or have compiled for the first slot, or answer it, or report progress with it."""
+    allowed_s: float = math.inf
+    """Time by which it must do so if it reports no progress."""
+    heard_s: float = -math.inf
+    """Time of its newest report of progress with this; -infinity if there is none."""
+    preparing: Progress | None = None
+    """This report, if it makes or resets environments."""
     late_s: float = math.inf
     """Time from which it is late with the first slot; infinity if the usual duration is not known, and -infinity once
     it is known to be late."""
@@ -90,6 +96,8 @@ class SchedulerState:
     """(number of its slots, pace, rank, worker) of every worker that can be assigned another work item."""
     in_time: int = 0
     """Number of workers that are up and IN_TIME."""
+    preparing: dict[int, Progress] = field(default_factory=dict)
+    """Report of every worker of these three groups that makes or resets environments."""
     items: dict[Hashable, Waiting] = field(default_factory=dict)
     """Work items that have not been delivered, by id."""
     places: SortedList = field(default_factory=SortedList)

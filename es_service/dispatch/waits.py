@@ -1,33 +1,38 @@
-"""What work waits for when nothing is heard of it: a first place in a cluster, or workers that start and compile."""
+"""What work waits for when nothing is heard of it: a first place in a cluster, workers that start and compile, or
+simulators that make and reset environments."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
 
+from es_service.dispatch.events import Progress
 from es_service.dispatch.scheduler_state import SchedulerState, is_waiting
 
 NOTICE_S = 5.0
 """Seconds without a first place after which a run is said to wait. A cluster with room takes less to start a process.
 """
 SILENCE_S = 2.0
-"""Seconds of a phase after which workers are said to compile for it."""
+"""Seconds of a phase after which workers are said to compile for it, or to make or reset environments."""
+AGAIN_S = 5.0
+"""Least time in seconds between two texts on how far these environments are."""
 
 
 class Waits:
     """Tells of waits as they begin and end."""
 
-    def __init__(self, on_wait: Callable[[str], None], on_compile: Callable[[str], None]) -> None:
+    def __init__(self, on_wait: Callable[[str], None], on_compile: Callable[[str, str], None]) -> None:
         """Tell of nothing yet.
 
         Args:
             on_wait: called with `Transport.shortage` when work has waited for a first place for NOTICE_S seconds, and
                 with "" when that wait is over.
-            on_compile: called with a kind of chunks when SILENCE_S seconds of a phase have passed and the first workers
-                start or compile for this kind; and with "" when one of them has compiled.
+            on_compile: called when SILENCE_S seconds of a phase have passed and something changes, with a kind of
+                chunks if the first workers start or compile for it, or "" if none does; and with a text on environments
+                that are made or reset, such as "making 16 environments: 4 of 16", or "".
         """
         self._on_wait, self._waits = on_wait, False
-        self._on_compile, self._compiles = on_compile, ""
+        self._on_compile, self._told, self._text_s = on_compile, ("", ""), -math.inf
         self._kinds: tuple[str, ...] = ()
         self._begun_s = math.inf
 
@@ -42,12 +47,21 @@ class Waits:
         if waits != self._waits:
             self._waits = waits
             self._on_wait(shortage() if waits else "")
-        compiles = ""
+        compiles = text = ""
         if since_s is None and now >= self._begun_s + SILENCE_S:
             compiles = next((kind for kind in self._kinds if _compiles_for(state, kind)), "")
-        if compiles != self._compiles:
-            self._compiles = compiles
-            self._on_compile(compiles)
+            text = _preparing(state)
+        if (compiles, text) != self._told and (not text or now >= self._text_s + AGAIN_S):
+            self._told, self._text_s = (compiles, text), now if text else self._text_s
+            self._on_compile(compiles, text)
+
+
+def _preparing(state: SchedulerState) -> str:
+    """How many environments workers make now, of how many; if none does, how many they reset."""
+    doing = min((report.doing for report in state.preparing.values()), default="")  # "making" is before "resetting"
+    reports = [report for report in state.preparing.values() if report.doing == doing]
+    done, total = sum(report.done for report in reports), sum(report.total for report in reports)
+    return str(Progress(0, doing, done, total)) if doing else ""
 
 
 def _compiles_for(state: SchedulerState, kind: str) -> bool:

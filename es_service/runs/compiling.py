@@ -28,13 +28,16 @@ CONTENTS = {
 MOST_FILES = 1000
 
 
-def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
+def compiling_sentence(spec: WorkerSpec, kind: str, text: str, *, here: bool) -> str:
     """That workers compile for a kind of chunk, or load what they have compiled before, and about how long it takes.
-    That they start, if they compile nothing.
+    That they start, if they compile nothing; or how many environments they have made or reset. Else empty.
 
     Args:
+        kind, text: see `on_compile` in `Waits`.
         here: whether they are on this machine; of others it is not known what they have on disk.
     """
+    if text or not kind:
+        return f"{text} ({spec.environment})" if text else ""
     first_s, again_s = BACKENDS[spec.rollout].compile_s
     if not first_s:
         return f"starting workers for {spec.environment} ({CONTENTS[kind]})"

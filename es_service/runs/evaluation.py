@@ -183,7 +183,7 @@ def evaluate(
         episodes: number of episodes per candidate.
         workers: number of worker processes; None: one per core.
         seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
-        on_compile: called with a sentence when the workers compile for more than two seconds.
+        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
 
     Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM; ConfigError as
     `evaluation_config`.
@@ -215,12 +215,12 @@ def workers_of(
 
     Args:
         chunks: number of chunks that can be computed at the same time; None: as in a generation of a run.
-        on_compile: called with a sentence when the workers compile for more than two seconds.
+        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
     """
 
-    def tell_compiling(kind: str) -> None:
-        if kind:
-            on_compile(compiling_sentence(spec, kind, here=True))
+    def tell_compiling(kind: str, text: str) -> None:
+        if sentence := compiling_sentence(spec, kind, text, here=True):
+            on_compile(sentence)
 
     with (
         stop_on_signals() as should_stop,

@@ -81,7 +81,7 @@ def work(
     """Run generations until the budget is spent or `on_generation` returns a `Stop`.
 
     Args:
-        on_compile: called when workers compile and nothing has been heard of the run for some time.
+        on_compile: called with a sentence when workers compile, or make or reset environments, for some time.
         strict: whether workers on another platform than the run's are an error.
         caller: what computes the episodes instead of the configured engine, if the task has none of its own.
     """
@@ -106,8 +106,8 @@ def work(
         waits = f"no worker has a place in the cluster; the run waits {until}. {shortage}"
         tell(waits if shortage else "a worker has a place in the cluster; the run begins")
 
-    def tell_compiling(kind: str) -> None:
-        sentence = compiling_sentence(spec, kind, here=config.compute.address is None) if kind else ""
+    def tell_compiling(kind: str, text: str) -> None:
+        sentence = compiling_sentence(spec, kind, text, here=config.compute.address is None)
         store.lock.say(doing=sentence)
         if sentence:
             _LOG.info(sentence)
@@ -260,7 +260,7 @@ def make_engine(
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_refusal: OnNotice = lambda refusal: None,
-    on_compile: Callable[[str], None] = lambda kind: None,
+    on_compile: Callable[[str, str], None] = lambda kind, text: None,
     *,
     at_once: int | None = None,
     outputs: tuple[str, ...] = (),

@@ -10,7 +10,7 @@ from es_service.dispatch.events import Command, Compiled, Event, Limits, StartWo
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, initial_state, next_time
 
-CONTAINERS = "starting", "up", "draining", "deadlines", "free", "items", "places", "late", "durations_s"
+CONTAINERS = "starting", "up", "draining", "deadlines", "preparing", "free", "items", "places", "late", "durations_s"
 LIMITS = Limits(
     workers=2,
     in_flight=2,
@@ -75,6 +75,9 @@ def check_consistency(state: SchedulerState) -> None:
         assert [record.rank for _, record in records] == sorted({record.rank for _, record in records})
         deadlines += [(at_s, worker) for worker, record in records if (at_s := next_time(record)) < math.inf]
     assert list(state.deadlines) == sorted(deadlines)
+    groups = {**state.starting, **state.up, **state.draining}
+    preparing = {worker: record.preparing for worker, record in groups.items() if record.preparing is not None}
+    assert state.preparing == preparing
     loads = [
         (len(record.slots), record.pace, record.rank, worker) for worker, record in ((w, state.up[w]) for w in state.up)
     ]

@@ -18,6 +18,7 @@ from es_service.dispatch.events import (
     Failure,
     Limits,
     Placed,
+    Progress,
     Result,
     SetWorkers,
     StartWorker,
@@ -33,8 +34,8 @@ from es_service.dispatch.scheduler_state import initial_state, next_deadline, pe
 from tests.es_service.scheduler_play import check_consistency, copied
 
 START_FATES = ("start_dies", "start_hangs", "no_place")
-COMPILE_FATES = ("compile_dies", "compile_hangs", "compile_slow", "compile_raises")
-ITEM_FATES = ("item_dies", "item_hangs", "item_slow", "item_raises", "contradicts")
+COMPILE_FATES = ("compile_dies", "compile_hangs", "compile_slow", "compile_makes", "compile_raises")
+ITEM_FATES = ("item_dies", "item_hangs", "item_slow", "item_long", "item_raises", "contradicts")
 FAULTS = (
     *START_FATES,
     *COMPILE_FATES,
@@ -91,6 +92,7 @@ class World:
         self.unplaced: set[int] = set()
         self.waits: set[int] = set()
         self.last_word: dict[int, float] = {}
+        self.heard: dict[int, float] = {}
         self.poison: dict[tuple, str] = {}
         # What a correct scheduler must know.
         self.wanted = self.limits.workers
@@ -168,8 +170,11 @@ class World:
             self.compute(worker, item_id, attempt)
             return
         fate = next((fate for fate in COMPILE_FATES if self.happens(fate)), "ok")
-        if fate != "compile_hangs":
-            seconds = self.random.random() + 10.0 * (fate == "compile_slow")
+        if fate == "compile_hangs":
+            self.report(worker, item_id, self.random.randint(0, 2), 4.0, "making")
+        else:
+            seconds = self.random.random() + 10.0 * (fate in ("compile_slow", "compile_makes"))
+            self.report(worker, item_id, 2 * (fate == "compile_makes"), 4.0, "making")
             self.at(seconds, self.end_compiling, worker, item_id, attempt, fate, seconds)
 
     def end_compiling(self, worker: int, item_id: tuple, attempt: int, fate: str, seconds: float) -> None:
@@ -188,8 +193,21 @@ class World:
 
     def compute(self, worker: int, item_id: tuple, attempt: int) -> None:
         fate = self.poison.get(item_id) or next((fate for fate in ITEM_FATES if self.happens(fate)), "ok")
-        if fate != "item_hangs":
-            self.at(self.random.random() + 10.0 * (fate == "item_slow"), self.end, worker, item_id, attempt, fate)
+        if fate == "item_hangs":
+            self.report(worker, item_id, self.random.randint(0, 3), 1.4)
+        else:
+            seconds = self.random.random() + 10.0 * (fate in ("item_slow", "item_long"))
+            self.report(worker, item_id, 7 * (fate == "item_long"), 1.4)
+            self.at(seconds, self.end, worker, item_id, attempt, fate)
+
+    def report(self, worker: int, item_id: tuple, times: int, every_s: float, doing: str = "") -> None:
+        """Reports of progress, the last of which may be long before the end."""
+        for number in range(1, times + 1):
+            self.at(number * every_s, self.say_progress, worker, item_id, Progress(worker, doing, number, times))
+
+    def say_progress(self, worker: int, item_id: tuple, event: Progress) -> None:
+        if worker in self.alive:
+            self.say(worker, event)
 
     def end(self, worker: int, item_id: tuple, attempt: int, fate: str) -> None:
         if worker not in self.alive and not self.happens("speaks_after_stop"):
@@ -205,6 +223,7 @@ class World:
             self.say(
                 worker, Result(worker, item_id, attempt) if fate == "ok" else Failure(worker, item_id, attempt, "again")
             )
+        self.seen["long"] += fate == "item_long"
         self.busy.discard(worker)
         self.begin(worker)
 
@@ -253,6 +272,8 @@ class World:
                 self.forget(worker, fault=not expected, charge=not expected)
             case Compiled(worker, kind) if worker in self.known:
                 self.told_compiled.add((worker, kind))
+            case Progress(worker) if worker in self.known:
+                self.heard[worker] = self.now
             case Result(worker, item_id, attempt):
                 if worker in self.known and (item_id, attempt) in self.open[worker]:
                     self.open[worker].remove((item_id, attempt))
@@ -335,8 +356,12 @@ class World:
             assert worker in self.up or self.now >= self.start_due[worker], "it could still have come up in time"
             if isinstance(event, Tick) and worker in self.up:
                 is_compiling = (worker, self.open[worker][0][0][0]) not in self.told_compiled
-                assert is_compiling == ("did not finish compiling" in reason)
+                assert is_compiling == ("compil" in reason)
                 self.seen["compiled too long"] += is_compiling
+                limit_s = self.limits.compile_timeout_s if is_compiling else self.limits.chunk_timeout_s
+                silent_s = self.now - self.heard.get(worker, -math.inf)
+                assert silent_s >= limit_s * 2 ** (self.open[worker][0][1] - 1) - 1e-9, "it has just reported progress"
+                self.seen["hangs after progress"] += "no progress" in reason
             self.forget(worker, fault=not has_no_place, charge=isinstance(event, Tick))
         self.known.discard(worker)
         self.up.discard(worker)
@@ -417,6 +442,10 @@ class World:
             self.down_since = None
         elif self.down_since is None:
             self.down_since = self.now
+        for worker, record in [*state.up.items(), *state.draining.items()]:
+            if record.slots and record.deadline_s > record.allowed_s:
+                longest_s = self.limits.compile_timeout_s * 2 ** (record.slots[0].attempt - 1)
+                assert record.deadline_s <= self.heard[worker] + longest_s, "a hang would be noticed late"
         usable = self.up - self.draining
         queued = self.queued()
         for worker in usable if queued else ():

@@ -20,7 +20,7 @@ import pytest
 
 from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
-from es_service.dispatch.events import Limits, Placed, WorkerLost, WorkerUp
+from es_service.dispatch.events import Limits, Placed, Progress, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import kept_subjects
@@ -165,6 +165,12 @@ def test_an_answer_that_has_begun_to_come_is_there(transport):
     sender.join()
     assert isinstance(message, Answer)
     np.testing.assert_array_equal(message.results, [LARGE])
+
+
+def test_what_a_worker_says_of_its_progress_is_passed_on(transport):
+    transport, (end, _) = transport
+    end.sendall(framed(("progress", "making", 4, 16)))
+    assert transport.receive(1.0) == Progress(0, "making", 4, 16)
 
 
 def test_a_child_has_its_place_before_it_comes_up():

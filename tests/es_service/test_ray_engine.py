@@ -12,10 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from es_service.dispatch import ray_engine as ray_engine_module
 from es_service.dispatch import waits
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_calls import IN_CALL_BYTES
+from es_service.dispatch.events import (
+    Compiled,
+    Drain,
+    Failure,
+    Limits,
+    Placed,
+    Progress,
+    SetWorkers,
+    WorkerLost,
+    WorkerUp,
+)
+from es_service.dispatch.ray_calls import IN_CALL_BYTES, Looks
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
@@ -50,13 +61,15 @@ class ActorDiedError(RayError):
 
 @dataclass(eq=False)
 class Actor:
-    """An actor that answers at once. `state`: pending (without a place), alive, hung or dead."""
+    """An actor that answers at once. `state`: pending (without a place), alive, busy, hung or dead."""
 
     number: int
     state: str
     owed: list[Ref] = field(default_factory=list)
     ran: int = 0
     """Chunks."""
+    seen: tuple[Any, str, int, int] = (0, "", 0, 0)
+    """What it answers when it is asked how far it is, while it does not hang."""
 
 
 @dataclass(eq=False)
@@ -143,6 +156,8 @@ class PretendedRay:
             "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)[1]]),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
+        looked = SimpleNamespace(remote=lambda: Ref(actor.seen, is_ready=actor.state in ("alive", "busy")))
+        calls["progress"] = SimpleNamespace(options=lambda concurrency_group: looked)
         return SimpleNamespace(itself=actor, **calls)
 
     def _caller(self, actor: Actor, name: str, body: Callable[..., Any]) -> Callable[..., Ref]:
@@ -570,3 +585,45 @@ def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_whil
         assert max(len(centres) for _, *centres in ray.calls) > 1
     large = [1, 0, 0, 1, KEPT_SUBJECTS - 2, 0, 1, 0, 1]
     assert found == ([0] * 9 if size == 1 else large)
+
+
+def test_an_actor_is_asked_how_far_it_is_with_a_call_that_takes_long():
+    """At each look but the first of a call. Its answer counts if it has changed and the call is still the oldest."""
+    ray = PretendedRay()
+    looks, first, second = Looks(ray), Ref(), Ref()
+    handle = ray.remote()(type(None)).options("SPREAD").remote(b"", 0, 0.0, 1)
+
+    def look(call: Ref, moves: int) -> list[Progress]:
+        ray.actors[0].seen = moves, "making", moves, 9
+        return looks.look({0: call}, {0: handle})
+
+    assert [look(first, 1), look(first, 2), look(first, 3)] == [[], [], []], "begun, asked, answered once"
+    assert look(first, 3) == [Progress(0, "making", 3, 9)]
+    assert [look(first, 3), look(first, 4)] == [[], []], "it hangs, and goes on"
+    assert look(first, 4) == [Progress(0, "making", 4, 9)]
+    assert [look(second, 5), look(second, 6), look(second, 7)] == [[], [], []], "an answer to the call before is none"
+    assert look(second, 7) == [Progress(0, "making", 7, 9)]
+    assert looks.look({}, {}) == [], "it has been killed"
+
+
+@pytest.mark.slow
+def test_a_call_that_takes_long_is_not_taken_for_one_that_hangs(monkeypatch):
+    """Until it shows no more progress, with more than three times its time."""
+    monkeypatch.setattr(ray_engine_module, "LOOK_S", 0.02)
+    ray, began = PretendedRay(), []
+    limits = Limits(1, chunk_timeout_s=0.6, first_chunk_timeout_s=0.6, restart_backoff_s=0.01)
+
+    def flies(actor: Actor) -> None:
+        actor.state = "busy"
+        ray.on_run = lambda actor: began.append(time.monotonic())
+        began.append(time.monotonic())
+
+    def moves() -> None:
+        if began and time.monotonic() - began[0] < 2.0:
+            ray.actors[0].seen = time.monotonic(), "", 0, 0
+
+    ray.on_run = flies
+    with Engine(transport(ray, limits), limits, moves) as engine:
+        assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert "no progress with work item TrainingChunk 0 of generation 3 for 0.6 s" in engine.last_loss()
+    assert 2.2 < began[1] - began[0] < 8.0

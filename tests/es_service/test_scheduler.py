@@ -15,6 +15,7 @@ from es_service.dispatch.events import (
     Drain,
     Fail,
     Failure,
+    Progress,
     Result,
     SetWorkers,
     StartWorker,
@@ -175,6 +176,72 @@ def test_the_message_of_a_missed_deadline_says_what_the_worker_was_doing():
     state, _ = play(state, (60.0, Result(0, "a", 1)), (61.0, items("b")))
     doing = "no answer to work item b within 50 s of computing (at least compute.chunk_timeout_s)"
     assert StopWorker(0, doing) in step(state, Tick(), 111.0)[1]
+
+
+def test_a_worker_that_reports_progress_has_its_time_again_from_each_report():
+    """The first policy that survives: all chunks were done at once, and this one takes as long as it takes."""
+    state, _ = play(ready(1, in_flight=1), (0.0, items("ab")), (0.5, Result(0, "a", 1)))
+    for number in range(1, 20):
+        state, commands = play(state, (0.5 + 9.0 * number, Tick()), (0.5 + 9.0 * number, Progress(0)))
+        assert (commands, next_deadline(state)) == ([], 0.5 + 9.0 * number + 10.0)
+    answered, commands = step(state, Result(0, "b", 1), 175.0)
+    assert commands == [Deliver("b")]
+    assert answered.durations_s["train"] == (0.5, 174.5)
+    reason = "no progress with work item b for 10 s (at least compute.chunk_timeout_s)"
+    assert step(state, Tick(), 181.5)[1][0] == StopWorker(0, reason), "one that hangs is noticed all the same"
+    slow, _ = play(ready(1, in_flight=1), (0.0, items("ab")), (20.0, Result(0, "a", 1)), (21.0, Progress(0)))
+    assert next_deadline(slow) == 20.0 + 5.0 * 20.0, "it has no less than without reports"
+
+
+def test_making_environments_has_a_time_of_its_own_from_each_to_the_next():
+    """Before the first item of a kind, and in an item; a step ends it."""
+    state, _ = play(cold(1), (0.0, items("ab")), (150.0, Progress(0, "making", 1, 2)), (300.0, Tick()))
+    assert (next_deadline(state), state.preparing[0].done) == (350.0, 1)
+    reason = "no progress with work item a for 200 s (compute.compile_timeout_s) while making 2 environments: 1 of 2"
+    assert step(state, Tick(), 350.0)[1][0] == StopWorker(0, reason)
+    state, _ = play(state, (310.0, Compiled(0, "train", 310.0)), (310.0, Result(0, "a", 1)))
+    assert (next_deadline(state), state.preparing) == (320.0, {})
+    state, _ = play(state, (311.0, Progress(0, "resetting", 0, 16)), (500.0, Tick()))
+    assert (state.lost_workers, next_deadline(state)) == (0, 511.0)
+    assert next_deadline(play(state, (500.0, Progress(0)))[0]) == 510.0
+    assert play(state, (500.0, WorkerLost(0, "killed")))[0].preparing == {}
+
+
+def test_a_start_takes_as_long_as_it_reports_progress():
+    state, _ = play(initial_state(replace(LIMITS, workers=1)), (0.0, Tick()), (40.0, Progress(0, "making", 0, 1)))
+    assert next_deadline(state) == 240.0
+    reason = "no progress for 200 s (compute.compile_timeout_s) while making 1 environment: 0 of 1"
+    state, commands = step(state, Tick(), 240.0)
+    assert commands == [StopWorker(0, reason), StartWorker(1)]
+    for stranger in (0, 7):
+        assert step(state, Progress(stranger), 241.0) == (state, [])
+
+
+def test_each_attempt_may_take_twice_as_long_as_the_one_before():
+    """Since not all work can report progress."""
+    state, now, waited = ready(1, max_attempts=14), 0.0, []
+    state, _ = play(state, (0.0, items("ab")), (0.0, Result(0, "a", 1)))
+    for worker in range(13):
+        waited.append(next_deadline(state) - now)
+        now = next_deadline(state)
+        state, commands = step(state, Tick(), now)
+        assert isinstance(commands[0], StopWorker)
+        now = max(now, state.start_at_s)
+        state, _ = play(state, (now, Tick()), (now, WorkerUp(worker + 1)), (now, Compiled(worker + 1, "train", 0.0)))
+    assert waited == [10.0 * 2 ** min(attempt, 10) for attempt in range(13)]
+    assert commands[0].reason == (
+        "no answer to work item b within 10240 s of computing (at least compute.chunk_timeout_s, 1024 times as long in "
+        "attempt 13)"
+    )
+
+
+def test_a_time_limit_that_the_config_gives_holds_whatever_is_reported():
+    state, _ = play(ready(1, time_limit_s=3.0), (0.0, items("a")), (2.5, Progress(0)))
+    reason = "no answer to work item a within 3 s of computing (task.time_limit_s)"
+    state, commands = step(state, Tick(), 3.0)
+    assert commands == [StopWorker(0, reason), StartWorker(1)]
+    state, _ = play(state, (4.0, WorkerUp(1)), (4.0, Compiled(1, "train", 0.0)))
+    assert (state.up[1].slots[0].attempt, next_deadline(state)) == (2, 7.0)
 
 
 def test_a_first_item_has_no_less_time_than_later_ones():

@@ -8,10 +8,22 @@ import pytest
 
 from es_service import api
 from es_service.dispatch import waits
-from es_service.dispatch.events import Compiled, Limits, Placed, Result, Submit, Tick, WorkerUp, WorkItem
+from es_service.dispatch.events import (
+    Compiled,
+    Limits,
+    Placed,
+    Progress,
+    Result,
+    SetWorkers,
+    Submit,
+    Tick,
+    WorkerLost,
+    WorkerUp,
+    WorkItem,
+)
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
-from es_service.dispatch.waits import NOTICE_S, SILENCE_S, Waits
+from es_service.dispatch.waits import AGAIN_S, NOTICE_S, SILENCE_S, Waits
 from es_service.protocol.messages import Chunk
 from es_service.runs import compiling, evaluation
 from es_service.runs.compiling import compiling_sentence, note_compiled, was_compiled
@@ -25,9 +37,9 @@ KINDS = ("EvaluationChunk", "TrainingChunk")
 def test_a_wait_is_told_when_it_begins_and_when_it_ends():
     """First for a place, then for a compiler, of one kind of chunks after another."""
     told, state = [], initial_state(Limits(1))
-    what = Waits(lambda shortage: told.append(("place", shortage)), lambda kind: told.append(("compile", kind)))
+    what = Waits(lambda shortage: told.append(("place", shortage)), lambda *of: told.append(("compile", *of)))
 
-    def at(now: float, *events) -> list[tuple[str, str]]:
+    def at(now: float, *events) -> list[tuple[str, ...]]:
         nonlocal state
         for event in events:
             handle(state, event, now)
@@ -42,29 +54,42 @@ def test_a_wait_is_told_when_it_begins_and_when_it_ends():
     what.begin(KINDS, 10.0)
     work = Submit(tuple(WorkItem(kind, kind) for kind in KINDS))
     assert at(10.0, work) == at(10.0 + 0.9 * SILENCE_S, WorkerUp(0)) == []
-    assert at(10.0 + SILENCE_S) == [("compile", KINDS[0])]
+    assert at(10.0 + SILENCE_S) == [("compile", KINDS[0], "")]
     assert at(20.0) == []
-    assert at(21.0, Compiled(0, KINDS[0], 5.0)) == [("compile", "")]
+    assert at(21.0, Compiled(0, KINDS[0], 5.0)) == [("compile", "", "")]
     assert at(22.0) == [], "it computes"
-    assert at(23.0, Result(0, KINDS[0], 1)) == [("compile", KINDS[1])]
-    assert at(24.0, Compiled(0, KINDS[1], 0.9), Result(0, KINDS[1], 1)) == [("compile", "")]
+    assert at(23.0, Result(0, KINDS[0], 1)) == [("compile", KINDS[1], "")]
+    assert at(24.0, Compiled(0, KINDS[1], 0.9), Result(0, KINDS[1], 1)) == [("compile", "", "")]
     what.begin(KINDS, 30.0)
     assert at(30.0, work) == at(30.0 + 2 * SILENCE_S) == [], "it computes, which a deadline limits"
+    assert at(40.0, Progress(0, "resetting", 4, 16)) == [("compile", "", "resetting 16 environments: 4 of 16")]
+    assert at(41.0, Progress(0, "resetting", 5, 16)) == [], "not of each of them"
+    both = Progress(0, "resetting", 9, 16), SetWorkers(2), WorkerUp(1), Submit((WorkItem("more", KINDS[0]),))
+    assert at(40.0 + AGAIN_S, *both) == [("compile", "", "resetting 16 environments: 9 of 16")]
+    making = Progress(1, "making", 1, 8)
+    assert at(40.0 + 2 * AGAIN_S, making) == [("compile", "", "making 8 environments: 1 of 8")]
+    assert at(52.0, WorkerLost(1, "killed")) == [], "soon after the last text"
+    assert at(53.0, Progress(0)) == [("compile", "", "")]
 
 
 def test_what_was_compiled_before_is_remembered_with_all_that_the_code_depends_on(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     kind, other = KINDS
-    assert "(evaluation episodes, first time, about 10 s)" in compiling_sentence(spec(rollout="simd"), kind, here=True)
+    assert "(evaluation episodes, first time, about 10 s)" in compiling_sentence(
+        spec(rollout="simd"), kind, "", here=True
+    )
     for known in (False, True):
         assert was_compiled(spec(), kind) == known
         note_compiled(spec(), kind)
-    assert compiling_sentence(spec(), kind, here=True) == (
+    assert compiling_sentence(spec(), kind, "", here=True) == (
         "loading compiled code for point_maze (evaluation episodes, about 6 s)"
     )
-    assert "(evaluation episodes, about 15 s the first time)" in compiling_sentence(spec(), kind, here=False)
-    starting = compiling_sentence(spec(rollout="host"), kind, here=True)
+    assert "(evaluation episodes, about 15 s the first time)" in compiling_sentence(spec(), kind, "", here=False)
+    starting = compiling_sentence(spec(rollout="host"), kind, "", here=True)
     assert starting == "starting workers for point_maze (evaluation episodes)", "they compile nothing"
+    making = "making 16 environments: 4 of 16"
+    assert compiling_sentence(spec(rollout="host"), kind, making, here=True) == f"{making} (point_maze)"
+    assert compiling_sentence(spec(), "", "", here=True) == ""
     assert was_compiled(spec(seed=9), kind)
     changed = (spec(episode_steps=9), spec(rollout="simd"), spec(sources={"workers/worker.py": "0"}))
     assert not any(was_compiled(one, kind) for one in changed)

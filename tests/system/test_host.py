@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from es_service import api, evaluator
+from es_service.dispatch import waits
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.helpers import workers_in_this_process
@@ -91,6 +92,63 @@ def test_a_core_of_an_actor_begins_the_next_work_item_while_the_other_one_comput
     with evaluator(config) as evaluate:
         fitness_N_E = evaluate(np.float32([[1.0], [0.0], [-1.0], [0.0]]), episodes=1, seed=0, generation=1).fitness
     np.testing.assert_array_equal(fitness_N_E[:, 0], [1.0, 0.0, -1.0, 0.0])
+
+
+SURVIVOR = """
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+class Drone:
+    observation_size, action_size, episode_steps = 3, 1, 10
+
+    def __init__(self):
+        time.sleep(0.1 * {times})
+
+    def reset(self, seed):
+        self.flies = seed % 4 == 0
+        return np.ones(3)
+
+    def step(self, action):
+        if self.flies:
+            time.sleep(0.1 * {times})
+            if Path("hang").exists():
+                Path("hang").unlink()
+                time.sleep(1000.0)
+        return np.ones(3), float(action[0]), not self.flies
+"""
+
+
+@pytest.mark.parametrize(
+    ("engine", "times"), [("inline", 1), pytest.param("ray", 4, marks=[pytest.mark.long, pytest.mark.alone])]
+)
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_the_first_policy_that_survives_is_no_worker_that_hangs(tmp_path, monkeypatch, engine, times):
+    """Its chunk, and making 16 environments, take longer than a worker may say nothing. One that hangs is noticed."""
+    (tmp_path / "flight.py").write_text(SURVIVOR.format(times=times))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(waits, "SILENCE_S", 0.3)
+    limits = dict.fromkeys(("chunk_timeout_s", "first_chunk_timeout_s", "compile_timeout_s"), 1.5 * times)
+    config = {
+        "task": {"environment": "python:flight:Drone"},
+        "policy": {"hidden": [], "observation_normalization": False},
+        "search": {"algorithm": "es", "pairs": 8, "evaluation_episodes": 1},
+        "budget": {"generations": 1},
+        "compute": {"engine": engine, "workers": 1, "max_attempts": 1} | limits,
+    }
+    said: list[str] = []
+    run = api.run(config, tmp_path / "run", on_notice=pytest.fail, on_compile=said.append).run
+    assert run.history.env_steps.iloc[-1] >= 1 + 16 + 2 * 9 + 1, "a pair flies"
+    assert any(re.fullmatch(r"making 15 environments: \d+ of 15 \(python:flight:Drone\)", text) for text in said), said
+    Path("hang").touch()
+    notices: list[str] = []
+    run = api.resume(run.folder, ["budget.generations=2", "compute.max_attempts=2"], on_notice=notices.append).run
+    assert run.history.lost_workers.tolist() == [0, 0, 1]
+    assert re.search(rf"no progress with work item \S+ 0 of generation \d for {1.5 * times:g} s \(", notices[0])
 
 
 FAULTS = {

@@ -97,8 +97,12 @@ if __name__ == "__main__":
         first = calls.submit(actor.run, *item(1.0))
         while not Path(sys.argv[1], "begun").exists():
             time.sleep(0.01)
+        hangs = actor.progress()
+        time.sleep(0.1)
+        assert actor.progress() == hangs, "it waits"
         second = calls.submit(actor.run, *item(-1.0))
         fitness = [pickle.loads(call.result())[0].fitness for call in (first, second)]
+    assert actor.progress() != hangs
     assert np.array_equal(fitness, np.full_like(fitness, 1.0) * [[1.0], [-1.0]]), fitness
 """
 

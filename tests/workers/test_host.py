@@ -130,7 +130,7 @@ def test_members_are_the_centre_and_its_noise_with_the_action_noise_of_their_add
                 reset_key, action_key = stream_keys(
                     3, (Domain.TRAINING_RESET, Domain.ACTION_NOISE), 5, 4 + p, 0, episode
                 )
-                environment = Lanes(make_host_task(DRIFT, {"wind": 0.05}))[0]
+                ((_, environment),) = Lanes(make_host_task(DRIFT, {"wind": 0.05})).of([0])
                 policy = LanePolicies(
                     worker_spec, member_D[None], subject.observation_mean_O, subject.observation_std_O, action_key[None]
                 )

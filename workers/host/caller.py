@@ -40,8 +40,8 @@ class Caller:
         self._given, self._limit_s = (name, dict(options)), limit_s
         self._child: Child | None = None
 
-    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
-        """(fitness, descriptor [B]). Raises CallFailedError if the call raised, ended its process, or took too long."""
+    def start(self) -> None:
+        """Start the process if there is none. Raises CallFailedError if the function cannot be imported there."""
         if self._child is None:
             self._child = Child("workers.host.caller", os.environ | same_imports())
             self._child.ask(*self._given)
@@ -50,6 +50,11 @@ class Caller:
             except CallFailedError:
                 self.close()
                 raise
+
+    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
+        """(fitness, descriptor [B]). Raises CallFailedError if the call raised, ended its process, or took too long."""
+        self.start()
+        assert self._child is not None, "it has been started"
         self._child.ask(parameters_D, seed)
         return self._answer(self._limit_s, f"no result within {self._limit_s:g} s (task.time_limit_s)")
 

@@ -5,6 +5,7 @@ Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import isfinite
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
+from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
 from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
@@ -37,10 +39,12 @@ class Lanes:
         self.task = task
         self._environments: dict[int, HostEnvironment] = {}
 
-    def __getitem__(self, lane: int) -> HostEnvironment:
-        if lane not in self._environments:
+    def of(self, lanes: Iterable[int]) -> list[tuple[int, HostEnvironment]]:
+        """These lanes, each with its environment; those that are missing are made, in this order."""
+        wanted = list(lanes)
+        for lane in progress.counted("making", [lane for lane in wanted if lane not in self._environments]):
             self._environments[lane] = HostEnvironment(self.task)
-        return self._environments[lane]
+        return [(lane, self._environments[lane]) for lane in wanted]
 
 
 def run_episodes(
@@ -73,8 +77,7 @@ def run_episodes(
     count, size, task, training = len(reset_keys_L_4), spec.policy.widths[0], lanes.task, action_keys_L_4 is not None
     policies = LanePolicies(spec, parameters_L_D, mean, std, action_keys_L_4)
     alive_L = np.ones(count, bool) if runs_L is None else runs_L.copy()
-    environments = [lanes[lane] if alive_L[lane] else None for lane in range(count)]
-    running = [(lane, environment) for lane, environment in enumerate(environments) if environment is not None]
+    running = lanes.of(np.flatnonzero(alive_L).tolist())
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     last_steps_T = np.arange(points) * spec.episode_steps // (points - 1)
     traced = frozenset() if training else frozenset(last_steps_T.tolist())
@@ -95,7 +98,7 @@ def run_episodes(
 
     lane = step = 0
     try:
-        for lane, environment in running:
+        for lane, environment in progress.counted("resetting", running):
             observation_L_O[lane] = environment.reset(seed_of(reset_keys_L_4[lane]))
             if not training:
                 trace_L_T_B[lane] = environment.descriptor()
@@ -113,6 +116,7 @@ def run_episodes(
             still = []
             for lane, environment in running:
                 seen_O, reward, done = environment.step(actions_L[lane])
+                progress.moved()
                 is_last = done or step == spec.episode_steps
                 if outputs:
                     now = Step(environment, observation_L_O[lane], action_L_A[lane], seen_O, reward, done)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.raised import raised
+from workers import progress
 from workers.environments.function_task import FunctionTask
 from workers.host.caller import CallFailedError
 from workers.host.episodes import Watched
@@ -53,6 +54,7 @@ def run_calls(
         if runs_L is None or runs_L[lane]:
             seed = seed_of(reset_keys_L_4[lane])
             fitness_L[lane], descriptor_L_B[lane], why = _called(task, called, parameters_L_D[lane], seed)
+            progress.moved()
             if why:
                 named = task.parameters.text(parameters_L_D[lane])
                 print(f"{task.name} failed with {named} (seed {seed}): {why}", file=sys.stderr, flush=True)

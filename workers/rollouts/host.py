@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -13,6 +13,7 @@ from es_service.protocol.options import OptionValue
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
+from workers import progress
 from workers.compilable import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
 from workers.host.caller import Caller
@@ -46,7 +47,7 @@ class Host(RolloutBackend):
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Functions that share the environments of a worker."""
-        run, count = make_runner(spec), spec.policy.parameters
+        (run, prepare), count = make_runner(spec), spec.policy.parameters
 
         def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
             parameters_L_D = members(spec, centre_D, unit, noise_keys_P).reshape(-1, count)
@@ -60,12 +61,16 @@ class Host(RolloutBackend):
         def policies(given, mean_L_O, std_L_O, policy_L, reset_keys_L):
             return run(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L)
 
-        functions = (training, evaluation, policies, gradient_summer(spec))
-        return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))
+        return ChunkFunctions(
+            Compilable(training, lambda *given: prepare(range(2 * len(given[4])))),
+            Compilable(evaluation, lambda *given: prepare(np.flatnonzero(given[-1]).tolist())),
+            Compilable(policies, lambda *given: prepare(range(len(given[-1])))),
+            Compilable(gradient_summer(spec), lambda *_: None),
+        )
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""
-        run = make_runner(spec)
+        run, _ = make_runner(spec)
         return Recordings(tuple(_recording(run, request) for request in requests), (), 0.0)
 
     def random_steps(
@@ -73,7 +78,7 @@ class Host(RolloutBackend):
     ) -> Callable[[int], int]:
         """Steps of each environment of the batch in turn; one that ends is reset."""
         made = make_host_task(task.name, options)
-        lanes = Lanes(made)
+        lanes = [environment for _, environment in Lanes(made).of(range(batch))]
         coordinates_A = np.arange(task.action_size, dtype=np.uint32)
         reset_keys_L_4 = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
         for lane in range(batch):
@@ -92,15 +97,20 @@ class Host(RolloutBackend):
         return call
 
 
-def make_runner(spec: WorkerSpec) -> Callable[..., Episodes]:
-    """`run_episodes` with the environments of a worker, or `run_calls` with its function."""
+def make_runner(spec: WorkerSpec) -> tuple[Callable[..., Episodes], Callable[[Iterable[int]], object]]:
+    """`run_episodes` with the environments of a worker, or `run_calls` with its function; and a function that makes
+    what runs in some lanes and is missing, which takes time but does not change what a run gives."""
     if is_function_task(spec.environment):
         given = spec.environment, spec.environment_options
-        function = make_function_task(*given)
-        called = function if spec.time_limit_s is None else Caller(*given, spec.time_limit_s)
-        return partial(run_calls, function, called, spec)
-    task = make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size)
-    return partial(run_episodes, Lanes(task), spec)
+        (function,) = [make_function_task(*given) for _ in progress.counted("making", given[:1])]
+        if spec.time_limit_s is None:
+            return partial(run_calls, function, function, spec), lambda lanes: None
+        caller = Caller(*given, spec.time_limit_s)
+        return partial(run_calls, function, caller, spec), lambda lanes: caller.start()
+    described = spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size
+    (task,) = [make_host_task(*described) for _ in progress.counted("making", described[:1])]
+    lanes = Lanes(task)
+    return partial(run_episodes, lanes, spec), lanes.of
 
 
 def _by_episode(keys_P_S_E_4: np.ndarray) -> np.ndarray:
