@@ -27,7 +27,6 @@ from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
-from es_service.errors import Interrupted
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
 from es_service.protocol.raised import raised
@@ -258,8 +257,6 @@ class Actors:
             return Failure(call.worker, call.item_id, call.attempt, said.message, said.traceback)
         except errors.RayError as error:
             return self._lost(call.worker, f"{self._place(call.worker)}: {fault_reason(error)}")
-        except Interrupted:  # a signal handler can raise this anywhere
-            raise
         except Exception as error:  # a damaged message can raise any exception when it is read
             said = raised(error)
             reason = f"{self._place(call.worker)}: its message cannot be read: {said.message}"
