@@ -111,6 +111,11 @@ class ComputeConfig(Section):
         description="Most MiB of elites' parameters that each worker keeps, of which it makes the policies of "
         "map_elites; what it does not keep is sent again. It never changes results.",
     )
+    worker_output_bytes: Count = Field(
+        2**20,
+        description="About how many bytes are kept of what each worker prints, its simulators included: the newest. "
+        "The last lines are told if the worker is lost.",
+    )
     dispatch_log: Switch = Field(
         False,
         description="Whether the run folder gets a dispatch.jsonl: what was sent to each worker, what it answered, and "

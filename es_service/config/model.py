@@ -277,6 +277,7 @@ def worker_spec(
         noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
         outputs=tuple(sorted({*outputs, *search.outputs()})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
+        output_bytes=compute.worker_output_bytes,
         sources=worker_sources(*settings.code),
         platform=compute.platform,
     )

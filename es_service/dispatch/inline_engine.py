@@ -2,8 +2,8 @@
 
 Children are started by exec with fixed settings (one XLA thread; the CPU, or a GPU) and never forked, so the caller's
 use of JAX has no effect on them. For the same reason, workers are never threads of this process. The engine itself has
-no threads either: it polls the sockets, so a child that stops in the middle of a message or does not read cannot block
-it.
+no threads either, but one that cuts what children print: it polls the sockets, so a child that stops in the middle of a
+message or does not read cannot block it.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
+from es_service.protocol.newest_output import NewestOutput
 from es_service.protocol.parent import guard_of, start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
@@ -48,7 +49,7 @@ from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 PIECE_S = 0.1
 """Longest wait in seconds for the next part of a message whose beginning has been received."""
 LAST_WORDS_BYTES = 2000
-"""At most this many bytes of a lost worker's output are read and reported, since it may have been writing for days."""
+"""At most this many bytes of a lost worker's output are reported."""
 
 
 def inline_engine(
@@ -79,13 +80,15 @@ class _Child:
 
     process: subprocess.Popen[bytes]
     log: IO[bytes]
-    """File with the child's output on stdout and stderr."""
+    """File with the newest part of the child's output on stdout and stderr."""
     control: socket.socket
     """Socket over which the child receives the sockets of its workers."""
     place: str = ""
     """The GPUs that it may use, as CUDA_VISIBLE_DEVICES names them."""
     guard: subprocess.Popen[bytes] | None = None
     """Ends the child's process group when the driver ends, for whatever reason."""
+    watched: int = -1
+    """Number of the file in `NewestOutput`."""
 
 
 @dataclass(eq=False)
@@ -111,7 +114,7 @@ class ChildProcesses:
         self._spec, self._threads = framed(spec), threads
         self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
         self._platforms: set[str] = set()
-        self._parent_cache_bytes = spec.parent_cache_bytes
+        self._parent_cache_bytes, self._output = spec.parent_cache_bytes, NewestOutput(spec.output_bytes)
         self._workers: dict[int, _Worker] = {}
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
@@ -200,12 +203,16 @@ class ChildProcesses:
             _kill(worker.child)  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
+        self._output.close()
 
     def _start_child(self, undo: ExitStack) -> _Child:
         """A new process, which gets the place at the GPUs that has the fewest workers."""
         taken = [worker.child.place for worker in self._workers.values()]
         free = min(self._places, key=lambda place: taken.count(place) / self._places.count(place), default="")
-        return _start_child(self._spec, undo, self._gpus, free)
+        child = _start_child(self._spec, undo, self._gpus, free)
+        child.watched = self._output.add(child.log.fileno())
+        undo.callback(self._output.forget, child.watched)
+        return child
 
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
         """A new number for a subject, and the message with both."""
@@ -286,6 +293,8 @@ class ChildProcesses:
         for number in lost:
             self._hear(number)
             self._forget(number)
+        _kill(child)
+        self._output.forget(child.watched)
         how, last_words = _end(child)
         if not reason:
             reason = f"worker {', '.join(map(str, lost))} (pid {child.process.pid}) ended with {how}"

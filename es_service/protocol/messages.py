@@ -136,6 +136,8 @@ class WorkerSpec:
     """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
     parent_cache_bytes: int = 2**28
     """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
+    output_bytes: int = 2**20
+    """Most bytes that are kept of what its process prints; see `newest_output.py`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
     platform: str = "any"

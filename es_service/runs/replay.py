@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import FloatArray
+from es_service.protocol.newest_output import NewestOutput
 from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
@@ -41,6 +43,8 @@ CERTIFIED = "certified"
 """Name of the certified policy as a candidate, whose generation is the number of the certification."""
 RECORD_S = 600.0
 """Longest time for the recordings of one report, compilation included."""
+ERRORS_BYTES = 2**16
+"""Most bytes that are kept of what a recording prints as errors, of which the last line is told."""
 
 
 @dataclass(frozen=True)
@@ -148,17 +152,28 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
 
 
 def _answer(question: tuple) -> Recordings:
-    with tempfile.TemporaryDirectory() as folder:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tempfile.TemporaryFile() as errors,
+        closing(NewestOutput(ERRORS_BYTES)) as output,
+    ):
         requests, answer = Path(folder) / "requests", Path(folder) / "answer"
         requests.write_bytes(pickle.dumps(question))
+        output.add(errors.fileno())
         words = [sys.executable, "-m", "workers.recording", str(requests), str(answer)]
         try:
             process = subprocess.run(
-                words, env=child_environment(), capture_output=True, text=True, timeout=RECORD_S, check=False
+                words,
+                env=child_environment(),
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                timeout=RECORD_S,
+                check=False,
             )
         except subprocess.TimeoutExpired:
             raise EvaluationError(f"episodes could not be recorded within {RECORD_S:g} s; choose fewer") from None
         if process.returncode:
-            last = (process.stderr.strip().splitlines() or ["it printed nothing"])[-1]
+            errors.seek(0)
+            last = (errors.read().decode(errors="replace").strip().splitlines() or ["it printed nothing"])[-1]
             raise EvaluationError(f"episodes could not be recorded: {last}")
         return pickle.loads(answer.read_bytes())

@@ -75,6 +75,15 @@ class Drift:
         return [self.place]
 
 
+class Loud(Drift):
+    """A drift that prints in each step, as code in C and a program beside it would."""
+
+    def step(self, action):
+        os.write(1, b"joint limit reached\n" * 500)
+        os.write(2, b"step %d is done\n" % self.steps)
+        return super().step(action)
+
+
 class Slow(Drift):
     """A drift whose first step in a worker that finds a file with this process's kind of fault has that fault."""
 

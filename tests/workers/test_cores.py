@@ -113,6 +113,45 @@ def test_a_core_that_has_nothing_left_to_do_begins_the_next_work_item(tmp_path, 
     assert done.returncode == 0, done.stderr.decode()
 
 
+LOUD = """
+import os, pickle, sys, time
+
+if __name__ == "__main__":
+    from es_service.protocol.messages import TrainingChunk
+    from tests.workers.host_tasks import Loud
+    from tests.workers.test_host import MODULE, centre_of, drift
+    from dataclasses import replace
+    from workers.actor import WorkerActor
+
+    given = replace(drift(), environment=f"python:{MODULE}:Loud", output_bytes=200_000)
+    actor = WorkerActor(pickle.dumps(given), 0, cores=int(sys.argv[1]))
+    actor.build()
+    chunks = [(0, TrainingChunk(1, chunk)) for chunk in range(6)]
+    actor.run(pickle.dumps(([], chunks)), pickle.dumps(centre_of(given)))
+    time.sleep(0.1)
+    os.write(1, b"the last line\\n")
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cores", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_an_actor_keeps_the_newest_of_the_files_to_which_ray_has_it_write(tmp_path, cores):
+    """Here another program opens them, as Ray does: one for each stream, to append. 12 MB are printed."""
+    program, files = tmp_path / "program.py", [tmp_path / "out", tmp_path / "err"]
+    program.write_text(LOUD)
+    with files[0].open("ab") as out, files[1].open("ab") as err:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            [sys.executable, program, str(cores)], env=environment, stdout=out, stderr=err, timeout=120
+        )
+    assert done.returncode == -signal.SIGKILL, files[1].read_text()
+    text = files[0].read_text()
+    assert len(text) <= 100_000
+    assert text.endswith("joint limit reached\nthe last line\n")
+    assert "step 39 is done" in files[1].read_text()
+
+
 def child_program(tmp_path, *arguments, program=PROGRAM):
     file = tmp_path / "program.py"
     file.write_text(textwrap.dedent(program))

@@ -14,6 +14,8 @@ import pytest
 
 from es_service import api, load_config
 from es_service.config.tasks import TASKS, task_of
+from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
@@ -82,6 +84,22 @@ def parameters_of(worker_spec, seed=0):
 
 def centre_of(worker_spec, **changes):
     return centre(parameters_of(worker_spec), observation_size=3, **changes)
+
+
+@pytest.mark.slow
+def test_of_what_a_simulator_prints_the_newest_is_kept_and_told_when_its_worker_is_killed():
+    """2 MB a chunk, of which 100 kB may stay; by child processes."""
+    loud = replace(drift(), environment=f"python:{MODULE}:Loud", output_bytes=100_000)
+    subject, sizes = centre_of(loud), []
+    with inline_engine(loud, Limits(workers=1)) as engine:
+        for chunk in range(4):
+            engine.evaluate([(subject, TrainingChunk(1, chunk))])
+            sizes.append(os.fstat(engine.transport._workers[0].child.log.fileno()).st_size)
+        time.sleep(0.1)
+        sizes.append(os.fstat(engine.transport._workers[0].child.log.fileno()).st_size)
+        assert sizes[-1] <= 75_000
+        assert max(sizes) < 2_000_000, sizes
+        assert re.search(r"joint limit reached\nstep \d+ is done$", engine.transport.kill(0))
 
 
 @pytest.mark.parametrize(
