@@ -154,7 +154,8 @@ class AskTell:
 
         Args:
             asked: what `ask` returned.
-            fitness: [N], maximised: the return of each episode. NaN: the episode is invalid.
+            fitness: [N], maximised: the return of each episode. NaN: the episode is invalid; so is -inf, unless
+                `search.allow_infeasible` says that it is infeasible.
             descriptor: [N, B]; None: the first B parameters of each row.
             valid: [N] of bools, false for episodes that failed.
             steps: [N], environment steps of each, from 1 to 2**31 - 1; None: 1 each.

@@ -261,6 +261,7 @@ def worker_spec(
         environment=settings.environment,
         environment_options=dict(settings.options),
         descriptor=settings.descriptor,
+        allow_infeasible=search.allow_infeasible,
         time_limit_s=settings.time_limit_s,
         descriptor_size=0 if settings.descriptor is None else len(task.descriptor_names),
         policy=policy_spec(config, task),

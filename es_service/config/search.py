@@ -44,6 +44,12 @@ class SearchConfig(Section):
     max_invalid_fraction: Fraction = Field(
         0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
     )
+    allow_infeasible: Switch = Field(
+        False,
+        description="Whether a fitness of -inf says that a point is infeasible, and not that something failed. It "
+        "ranks last and enters neither map nor novelty archive, as an invalid one does; the history counts it apart "
+        "and max_invalid_fraction leaves it out.",
+    )
     init_from: Text | None = Field(
         None,
         description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
@@ -64,6 +70,8 @@ class SearchConfig(Section):
     """The only number of centres that is allowed, or the key that has it; None: any number."""
     needs_start: ClassVar[str] = ""
     """What the method needs `init_from` for, as a clause about it; empty if it can start from random weights."""
+    spread_by: ClassVar[tuple[str, ...]] = ()
+    """Keys whose smaller values keep new policies nearer to those of which they are made."""
     needs_map: ClassVar[str] = ""
     """What the method needs a behaviour map for, as a clause about it: "whose ..."; empty if it needs none."""
     gathers_statistics: ClassVar[bool] = False
@@ -153,6 +161,7 @@ class PopulationConfig(SearchConfig):
         PresetRow("search.common_random_numbers", True, False, "literature: our choice. uber: ME-ES."),
     )
     gathers_statistics = True
+    spread_by = ("search.sigma", "search.step.learning_rate")
     unused = ()
 
     def populations(self) -> int:

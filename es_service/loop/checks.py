@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.problems import one_of
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import EvaluationError, WayOut
+from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import Centre, EpisodesResult
 from es_service.protocol.recipes import Recipes
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
@@ -168,39 +170,61 @@ def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
     return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
 
 
+def infeasible_members(result: EpisodesResult) -> NDArray[np.bool_]:
+    """Whether the fitness of each member (or episode) is -inf, which says that it is infeasible, with its axes."""
+    return np.isneginf(result.fitness)
+
+
 def invalidate(
-    populations: Sequence[EpisodesResult], max_invalid_fraction: float, generation: int
-) -> list[EpisodesResult]:
-    """The populations with fitness NaN, which ranks last, for every invalid member.
+    populations: Sequence[EpisodesResult], search: SearchConfig, generation: int
+) -> tuple[list[EpisodesResult], int]:
+    """The populations with fitness NaN, which ranks last, for every invalid and every infeasible member; and how many
+    are infeasible, which none is unless `search.allow_infeasible` is set.
 
     Raises:
-        EvaluationError: more than `max_invalid_fraction` of a generation's members are invalid.
+        EvaluationError: more than `search.max_invalid_fraction` of a generation's members are invalid.
     """
     valid = [valid_members(population) for population in populations]
-    invalid, members = (
-        sum(int(np.count_nonzero(~mask_P_S)) for mask_P_S in valid),
-        sum(mask_P_S.size for mask_P_S in valid),
-    )
-    if invalid > max_invalid_fraction * members:
+    infeasible = sum(int(np.count_nonzero(infeasible_members(population))) for population in populations)
+    allowed = infeasible if search.allow_infeasible else 0
+    members = sum(mask_P_S.size for mask_P_S in valid)
+    invalid = sum(int(np.count_nonzero(~mask_P_S)) for mask_P_S in valid) - allowed
+    if invalid > search.max_invalid_fraction * members:
         told = [text for population in populations for text in population.failures]
-        first = f" The first of which more is known: {told[0]}" if told else ""
+        nowhere = [~np.isfinite(one.descriptor).all(axis=-1) for one in populations]
+        if search.allow_infeasible:
+            nowhere = [mask & ~infeasible_members(one) for mask, one in zip(nowhere, populations, strict=True)]
+        counts = {
+            "fitness": sum(np.count_nonzero(~np.isfinite(one.fitness)) for one in populations) - allowed,
+            "descriptor": sum(map(np.count_nonzero, nowhere)),
+        }
+        which = " and ".join(f"a {name} that is not finite ({count:,})" for name, count in counts.items() if count)
+        hints = [f"smaller values of {one_of(search.spread_by, 'and')} may help"] if search.spread_by else []
+        if told:
+            which, hints = "no valid result", [*hints, f"the first of which more is known: {told[0]}"]
+        elif infeasible > allowed:
+            hints = [INFEASIBLE]
         raise EvaluationError(
-            f"generation {generation}: {invalid} of {members} members returned a fitness or descriptor that is "
-            f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
-            f"generation {generation - 1} is saved; a smaller search.sigma or learning rate may help.{first}",
+            f"generation {generation}: {invalid} of {members} members returned {which}, more than "
+            f"search.max_invalid_fraction ({search.max_invalid_fraction}) allows. "
+            + "; ".join([f"Everything up to generation {generation - 1} is saved", *hints]),
             field="search.max_invalid_fraction",
-            value=max_invalid_fraction,
+            value=search.max_invalid_fraction,
         )
     return [
         replace(population, fitness=np.where(valid_P_S, population.fitness, np.float32(np.nan)))
         for population, valid_P_S in zip(populations, valid, strict=True)
-    ]
+    ], allowed
 
 
-def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str) -> None:
-    """Raise an EvaluationError if no episode of any initial centre is valid; this is an error of the task."""
+def require_some_finite(
+    evaluations: Sequence[EpisodesResult], environment: str, *, allow_infeasible: bool = False
+) -> None:
+    """Raise an EvaluationError if no episode of any initial centre is valid, nor infeasible where that is allowed; this
+    is an error of the task."""
     count = sum(evaluation.fitness.size for evaluation in evaluations)
-    if any(valid_members(evaluation).any() for evaluation in evaluations):
+    infeasible = any(infeasible_members(evaluation).any() for evaluation in evaluations)
+    if any(valid_members(evaluation).any() for evaluation in evaluations) or (allow_infeasible and infeasible):
         return
     finite = {
         "return": any(np.isfinite(evaluation.returns).any() for evaluation in evaluations),
@@ -211,7 +235,7 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
     why = (
         f"the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the shortest episode "
         f"has {steps} steps. The run cannot learn from this: look for a division by 0, a root or logarithm of a "
-        f"negative number, or physics that diverges, in the task {environment}"
+        f"negative number, or physics that diverges, in the task {environment}{f'; {INFEASIBLE}' if infeasible else ''}"
     )
     if told := [text for evaluation in evaluations for text in evaluation.failures]:
         why = f"each of the {count} episodes of the initial centres failed. The first: {told[0]}"

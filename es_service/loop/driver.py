@@ -222,8 +222,8 @@ def evaluate(
     )
     clock.lap("seconds_rollout")
     members = [*populations, *map(as_population, policies)]
-    members = invalidate(members, config.search.max_invalid_fraction, proposal.generation)
-    return Evaluations(members[: len(asks)], policies, members, observed)
+    members, infeasible = invalidate(members, config.search, proposal.generation)
+    return Evaluations(members[: len(asks)], policies, members, observed, infeasible)
 
 
 def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations: Evaluations, clock: Clock) -> Update:
@@ -236,7 +236,8 @@ def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations
     results = evaluate_centres(evaluator, new_centres, config.search.evaluation_episodes, resets=resets)
     clock.lap("seconds_evaluation")
     if not proposal.asked:
-        require_some_finite(results, config.task.environment)
+        allow_infeasible = config.search.allow_infeasible
+        require_some_finite(results, config.task.environment, allow_infeasible=allow_infeasible)
         evaluated = initial_centres(new_centres, results, config, stepped.weight.value)
     else:
         evaluated = in_ask_order(

@@ -87,13 +87,15 @@ class Evaluations:
     """Results of what was proposed."""
 
     populations: Sequence[EpisodesResult]
-    """Of each population [P, S]; the fitness of invalid members is NaN."""
+    """Of each population [P, S]; the fitness of invalid and of infeasible members is NaN."""
     policies: Sequence[EpisodesResult]
     """Of each ask for policies [N, E]."""
     members: Sequence[EpisodesResult]
     """The populations, and the policies as if they were one each."""
     observed: Sequence[Moments]
     """Moments of the populations' observations, in the order in which they are merged."""
+    infeasible: int = 0
+    """Number of members that are infeasible, whose fitness is NaN, too."""
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,7 @@ _CORRECTED = (
 )
 CORRECTED = tuple(column.name for column in _CORRECTED)
 """Names of these columns, which a run has if `map.correct_every` is set."""
+_INFEASIBLE = Column("infeasible_members", "INTEGER", True, "members with a fitness of -inf, which are no invalid ones")
 _EPISODES = (
     Column("fitness_first", "REAL", False, "fitness of its first evaluation episode, which a replay shows"),
     Column("reset_seed", "INTEGER", False, "seed in the addresses of the resets of its evaluation episodes"),
@@ -118,11 +119,14 @@ _SEARCH_AND_TIMES = (
 )
 
 
-def history_columns(task: TaskSpec, has_map: bool, corrects: bool = False) -> tuple[Column, ...]:
+def history_columns(
+    task: TaskSpec, has_map: bool, corrects: bool = False, allows_infeasible: bool = False
+) -> tuple[Column, ...]:
     """All columns of a run, with those of its descriptor's dimensions, of its goal and of its map, if it has these.
 
     Args:
         corrects: whether `map.correct_every` is set.
+        allows_infeasible: whether `search.allow_infeasible` is set.
     """
     descriptor = tuple(
         column
@@ -134,7 +138,8 @@ def history_columns(task: TaskSpec, has_map: bool, corrects: bool = False) -> tu
     )
     goal, of_map = _GOAL if task.has_goal else (), _MAP if has_map else ()
     corrected = _CORRECTED if has_map and corrects else ()
-    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *_SEARCH_AND_TIMES)
+    infeasible = (_INFEASIBLE,) if allows_infeasible else ()
+    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES)
 
 
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
@@ -194,15 +199,16 @@ def with_gaps(values_N: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
+def population_columns(populations: Sequence[EpisodesResult], infeasible: int = 0) -> HistoryRow:
     """Number of invalid members, and quartiles of the valid members' fitness and return, of all populations together.
 
     Args:
-        populations: fitness is NaN for invalid members, which only these have; empty for generation 0.
+        populations: fitness is NaN for invalid and infeasible members, which only these have; empty for generation 0.
+        infeasible: number of infeasible members.
     """
     fitness_N = np.concatenate([np.zeros(0, np.float32), *(population.fitness.ravel() for population in populations)])
     returns_N = np.concatenate([np.zeros(0, np.float32), *(population.returns.ravel() for population in populations)])
-    columns: HistoryRow = {"invalid_members": int(np.isnan(fitness_N).sum())}
+    columns: HistoryRow = {"invalid_members": int(np.isnan(fitness_N).sum()) - infeasible}
     for quantity, values in (("fitness", fitness_N), ("return", returns_N)):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
         if not populations:

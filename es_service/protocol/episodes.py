@@ -11,6 +11,8 @@ from es_service.protocol.messages import EpisodesResult
 
 ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
 """Arrays that every result has."""
+INFEASIBLE = "if -inf says that the point is infeasible, set search.allow_infeasible = true"
+"""The end of a message about a fitness of -inf, which is invalid unless the config allows infeasible points."""
 
 
 def each(change: Callable[..., np.ndarray], *results: EpisodesResult, traces: bool = True) -> EpisodesResult:

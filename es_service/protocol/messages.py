@@ -128,6 +128,8 @@ class WorkerSpec:
     """Rank of the noise of each weight matrix, as in `low_rank.py`; 0: each parameter has a number of its own."""
     descriptor: DescriptorChoice | None = None
     """Descriptor that the config chooses; None: that of the task."""
+    allow_infeasible: bool = False
+    """Whether a fitness of -inf says that a point is infeasible, which is no failure."""
     time_limit_s: float | None = None
     """Longest time of a call of a function, if the task is one; None: it has none."""
     descriptor_size: int = 0

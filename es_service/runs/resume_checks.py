@@ -76,8 +76,9 @@ def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, An
 
 def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
     """The columns of a run's history, and those of its evaluated centres."""
-    corrects = config.map.correct_every is not None
-    return history_columns(task, config.map.enabled, corrects), evaluated_columns(task, config.map.enabled)
+    has_map, corrects = config.map.enabled, config.map.correct_every is not None
+    history = history_columns(task, has_map, corrects, config.search.allow_infeasible)
+    return history, evaluated_columns(task, has_map)
 
 
 def _budget_of_a_fork(config: RunConfig, status: RunStatus) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
-from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
@@ -45,6 +44,7 @@ from es_service.protocol.messages import (
     evaluation_chunks,
 )
 from es_service.protocol.policies import Policies, PolicyChunk, slots
+from es_service.runs.resume_checks import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
 from es_service.search.novelty import extended
@@ -341,14 +341,15 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
     if isinstance(config.search, PopulationConfig):  # with policies, only the first ones enter the archive
         past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
         search = replace(search, algorithm=_with_past(search.algorithm, past_N_B))
+    history, evaluations = columns(config, task)
     meta = RunMeta(
         run_id="measurement",
         created="",
         config=config.model_dump(mode="json"),
         constants=config.constants(),
         task=asdict(task),
-        columns=history_columns(task, config.map.enabled, config.map.correct_every is not None),
-        evaluation_columns=evaluated_columns(task, config.map.enabled),
+        columns=history,
+        evaluation_columns=evaluations,
     )
     replay, times = _Replay(answers, random, bounds_B_2), list[tuple[float, float]]()
 

@@ -173,6 +173,32 @@ def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
     assert all(np.isfinite(row["population_fitness_min"]) for row in store.rows[1:])
 
 
+@pytest.mark.parametrize("shaping", ["ranks", "returns"])
+def test_infeasible_members_rank_as_invalid_ones_do_and_are_counted_apart(shaping):
+    """Their fitness is -inf. They do not count as invalid, also where their descriptor is not finite."""
+
+    def spoil(value):
+        def spoiled(chunk, result):
+            if isinstance(chunk, TrainingChunk) and chunk.chunk_id == 1:
+                result.fitness[:, 0] = value
+                result.descriptor[1, 0] = np.nan
+            return result
+
+        return spoiled
+
+    def run(value, **search):
+        config = small_config(shaping={"kind": shaping}, **search)
+        state, store, *_ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil(value)))
+        return state, store.rows[1:]
+
+    (invalid, of_invalid), (state, rows) = run(np.nan), run(-np.inf, allow_infeasible=True, max_invalid_fraction=0.0)
+    np.testing.assert_array_equal(state.search.centres[0].centre_D, invalid.search.centres[0].centre_D)
+    count = of_invalid[0]["invalid_members"]
+    assert count > 0
+    assert "infeasible_members" not in of_invalid[0]
+    assert {(row["invalid_members"], row["infeasible_members"]) for row in rows} == {(0, count)}
+
+
 def test_too_many_invalid_members_stop_the_run_with_a_named_error():
     def spoil(chunk, result):
         if isinstance(chunk, TrainingChunk) and chunk.generation == 3:
@@ -181,7 +207,9 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
 
     config = small_config(max_invalid_fraction=0.25)
     with pytest.raises(
-        EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"
+        EvaluationError,
+        match=r"generation 3: 54 of 96 members returned a fitness that is not finite \(54\), more than "
+        r"search.max_invalid_fraction \(0.25\) .* smaller values of search.sigma and search.step.learning_rate may",
     ):
         run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
 

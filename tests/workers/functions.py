@@ -61,6 +61,27 @@ def forgetful(parameters):
 forgetful.parameters = {f"x{index}": (0.0, 1.0) for index in range(20)}
 
 
+def tower(parameters):
+    """Three quarters of its designs are infeasible; a design beyond 0.95 is a failure."""
+    a, b = parameters
+    if a + b < 1.2:
+        return -math.inf, (a, b)
+    return (math.nan if max(a, b) > 0.95 else -((a - 0.9) ** 2) - (b - 0.9) ** 2), (a, b)
+
+
+tower.parameters = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
+tower.descriptor_names, tower.descriptor_bounds = ("a", "b"), ((0.0, 1.0), (0.0, 1.0))
+tower.start = {"a": 0.9, "b": 0.9}
+
+
+def nowhere(parameters):
+    """All is infeasible, and has no place."""
+    return -math.inf, (math.nan, math.nan)
+
+
+nowhere.parameters, nowhere.descriptor_names, nowhere.descriptor_bounds = 2, ("a", "b"), ((0.0, 1.0), (0.0, 1.0))
+
+
 class Uncalled:
     """Its objects are no functions."""
 

@@ -140,7 +140,7 @@ def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, c
     assert (run.map[["x", "y"]] <= 0.0).all(axis=None)
     assert run.history.invalid_members.iloc[1:].min() > 0
     told = capfd.readouterr().err
-    for why in ("ValueError: this quarter is forbidden", "the fitness nan and", "returned the fitness 'many'; it must"):
+    for why in ("ValueError: this quarter is forbidden", "the fitness nan is", "returned the fitness 'many'; it must"):
         (line, *_) = [one for one in told.splitlines() if why in one]
         assert line.startswith(f"{FRAGILE} failed with x = "), line
     logged = [one for one in caplog.records if one.levelname == "WARNING" and " failed: " in one.getMessage()]
@@ -162,7 +162,7 @@ def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, c
 
 NAMED = (
     rf"{re.escape(FRAGILE)} failed: episode 0 of policy (?P<policy>\d+) with x = (?P<x>\S+), y = (?P<y>\S+) "
-    r"\(seed (?P<seed>\d+)\): (ValueError: this quarter is|the fitness nan and|.* returned the fitness 'many')"
+    r"\(seed (?P<seed>\d+)\): (ValueError: this quarter is|the fitness nan is|.* returned the fitness 'many')"
 )
 
 
@@ -174,6 +174,50 @@ def test_a_function_without_a_return_ends_the_run_with_a_sentence_that_says_so(t
     )
     with pytest.raises(EvaluationError, match=sentence):
         api.run(config_of(f"function:{MODULE}:forgetful"), tmp_path / "run")
+
+
+TOWER = f"function:{MODULE}:tower"
+WIDE = MAP_ELITES | {"batch": 64, "iso_sigma": 3.0, "evaluation_episodes": 1}
+
+
+@pytest.mark.usefixtures("one_process")
+def test_infeasible_points_are_counted_apart_and_enter_nothing_if_they_are_allowed(tmp_path, capfd):
+    search = WIDE | {"allow_infeasible": True, "max_invalid_fraction": 0.5}
+    run = api.run(config_of(TOWER, search), tmp_path / "run", on_notice=[].append).run
+    assert (run.map.a + run.map.b >= 1.2).all()
+    assert np.isfinite(run.map.fitness).all()
+    assert (run.novelty.a + run.novelty.b >= 1.2).all()
+    infeasible, invalid = run.history.infeasible_members, run.history.invalid_members
+    assert infeasible.iloc[0] == 0
+    assert infeasible.iloc[1:].min() > 32
+    assert 0 < invalid.sum() < infeasible.sum()
+    told = [line for line in capfd.readouterr().err.splitlines() if " failed with " in line]
+    assert told
+    assert all("the fitness nan is" in line for line in told)
+    goes_on = api.resume(tmp_path / "run", ["budget.generations=5"], on_notice=[].append).run
+    whole = api.run(config_of(TOWER, search, generations=5), tmp_path / "whole", on_notice=[].append).run
+    assert goes_on.digest() == whole.digest()
+
+
+@pytest.mark.usefixtures("one_process")
+def test_a_run_may_begin_where_all_is_infeasible(tmp_path):
+    search = WIDE | {"allow_infeasible": True, "max_invalid_fraction": 0.0}
+    run = api.run(config_of(f"function:{MODULE}:nowhere", search), tmp_path / "run").run
+    assert len(run.map) == 0
+    assert run.history.infeasible_members.tolist()[1:] == [64] * (len(run.history) - 1)
+
+
+@pytest.mark.usefixtures("one_process")
+def test_infeasible_points_that_are_not_allowed_say_what_is_not_finite_and_which_keys_help(tmp_path):
+    with pytest.raises(EvaluationError) as caught:
+        api.run(config_of(TOWER, WIDE), tmp_path / "run", on_notice=[].append)
+    sentence = str(caught.value)
+    assert re.search(r"generation 1: \d\d of 64 members returned no valid result, more than search.max_inv", sentence)
+    assert "smaller values of search.iso_sigma and search.line_sigma may help" in sentence
+    assert "the fitness -inf is no finite number that float32 holds; if -inf says that the point is inf" in sentence
+    assert "set search.allow_infeasible = true" in sentence
+    assert "search.sigma" not in sentence
+    assert "descriptor" not in sentence
 
 
 @pytest.mark.usefixtures("one_process")

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
@@ -151,6 +152,9 @@ def run_episodes(
         returns_L, reward_L = returns_L.astype(np.float32), reward_L.astype(np.float32)
     failures = []
     for lane in np.flatnonzero(steps_L > 0).tolist():
+        fitness = reward_L[lane] if spec.fitness == "final" else returns_L[lane]
+        if spec.allow_infeasible and fitness == -np.inf:
+            continue
         if why := _why_invalid(bad_reward_L.get(lane), returns_L[lane], descriptor_L_B[lane]):
             shown = shown_parameters(parameters_L_D[lane])
             failures.append(
@@ -178,7 +182,8 @@ def _why_invalid(bad_reward: tuple[int, float] | None, returns: np.float32, desc
         bad_reward: step and value of its first reward that is not finite; None if all are.
     """
     if bad_reward is not None:
-        return f"the reward of step {bad_reward[0]} is {bad_reward[1]:g}"
+        hint = f"; {INFEASIBLE}" if bad_reward[1] == -np.inf else ""
+        return f"the reward of step {bad_reward[0]} is {bad_reward[1]:g}{hint}"
     if not np.isfinite(returns):
         return f"the sum of its rewards is {returns:g}, beyond what float32 holds"
     if not np.isfinite(descriptor_B).all():

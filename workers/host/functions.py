@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.raised import raised
 from workers import progress
@@ -45,7 +46,8 @@ def run_calls(
         called: calls the task, here or in another process.
         others: those of `workers.host.episodes.run_episodes`. Keys of the noise only tell training from evaluation.
 
-    A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr.
+    A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr,
+    unless it says by -inf that a point is infeasible, and that is allowed.
     """
     lanes, failures = len(reset_keys_L_4), []
     fitness_L = np.zeros(lanes, np.float32)
@@ -53,7 +55,8 @@ def run_calls(
     for lane in range(lanes):
         if runs_L is None or runs_L[lane]:
             seed = seed_of(reset_keys_L_4[lane])
-            fitness_L[lane], descriptor_L_B[lane], why = _called(task, called, parameters_L_D[lane], seed)
+            result = _called(task, called, parameters_L_D[lane], seed, allow_infeasible=spec.allow_infeasible)
+            fitness_L[lane], descriptor_L_B[lane], why = result
             progress.moved()
             if why:
                 named = task.parameters.text(parameters_L_D[lane])
@@ -82,16 +85,25 @@ def run_calls(
 
 
 def _called(
-    task: FunctionTask, called: Callable[[FloatArray, int], tuple[float, Any]], parameters_D: FloatArray, seed: int
+    task: FunctionTask,
+    called: Callable[[FloatArray, int], tuple[float, Any]],
+    parameters_D: FloatArray,
+    seed: int,
+    *,
+    allow_infeasible: bool = False,
 ) -> tuple[float, Any, str]:
     """(fitness, descriptor, empty text) of a call; if it fails, NaN and the reason."""
     try:
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and invalid
             fitness, descriptor_B = called(parameters_D, seed)
-            if np.isfinite(np.float32(fitness)) and np.isfinite(descriptor_B).all():
+            is_finite, is_place = np.isfinite(np.float32(fitness)), np.isfinite(descriptor_B).all()
+            if (is_finite and is_place) or (allow_infeasible and fitness == -np.inf):
                 return fitness, descriptor_B, ""
-        values = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()}"
-        why = f"{values} are not finite numbers that float32 holds"
+        wrong = [] if is_finite else [f"the fitness {fitness:g} is no finite number that float32 holds"]
+        wrong += (
+            [] if is_place else [f"the descriptor {descriptor_B.tolist()} has numbers that are not finite in float32"]
+        )
+        why = " and ".join(wrong) + (f"; {INFEASIBLE}" if fitness == -np.inf else "")
     except CallFailedError as error:
         why = str(error)
     except (Exception, SystemExit) as error:  # the user's code can raise anything

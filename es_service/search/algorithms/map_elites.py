@@ -78,6 +78,7 @@ class MapElitesSettings(SearchConfig):
     )
     first_centres = 32
     needs_map = "whose policies descend from elites of the map"
+    spread_by = ("search.iso_sigma", "search.line_sigma")
 
     def policies(self) -> int:
         """A batch."""
