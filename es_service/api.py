@@ -86,8 +86,9 @@ def run(
         config: a RunConfig, or what `load_config` accepts.
         out: folder of the run, new or empty, which is created with its parents; default
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
-        on_generation: called with the history row of each generation after it is committed. If it returns
-            `Stop("reason")`, the run ends there with this reason, and can be resumed; other values have no effect.
+        on_generation: called with the history row of each generation after it is committed, or while another program
+            holds the database, after it has begun to wait for that. If it returns `Stop("reason")`, the run ends there
+            with this reason, and can be resumed; other values have no effect.
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.

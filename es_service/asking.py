@@ -150,7 +150,8 @@ class AskTell:
         moments: tuple[float, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Tell the results of what was asked, in the order of its rows; when it returns, a generation that is complete
-        has been committed. Results are told once: a second call for the same rows is refused.
+        has been committed, or waits for another program that holds the database, which a notice says. Results are told
+        once: a second call for the same rows is refused.
 
         Args:
             asked: what `ask` returned.

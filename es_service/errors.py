@@ -94,6 +94,10 @@ class NotInRunError(ServiceError, LookupError):
     """A run does not have what was requested, such as a map, a cell or an elite (exit code 2)."""
 
 
+class DatabaseHeldError(StoreError):
+    """Another program, such as a viewer, holds the database of a run."""
+
+
 class RunLockedError(StoreError):
     """Another driver is writing to this run."""
 

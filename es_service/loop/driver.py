@@ -73,7 +73,7 @@ def run(
 
     Args:
         state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
-        report: called with each history row after it has been committed. A `Stop` that it returns ends the session, and
+        report: called with each history row after `store` has taken it. A `Stop` that it returns ends the session, and
             any other value has no effect.
         failed: called before that with texts that name the generation's failed episodes, if there are any of which
             the rollouts know more.

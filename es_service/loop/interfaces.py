@@ -32,7 +32,10 @@ class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
     def part(self, name: str) -> Mapping[str, np.ndarray]: ...
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None: ...
+
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
+        """Take a generation, whose parts `part` returns from now on."""
+        ...
 
 
 @dataclass(frozen=True)

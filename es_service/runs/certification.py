@@ -16,6 +16,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -44,6 +45,7 @@ from es_service.runs.identity import changes_since, code_of
 from es_service.runs.selection import Parameters, halved, new_episodes
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
+from es_service.runs.waiting import telling_once, when_free
 from es_service.store.writer import RunStore
 
 OTHER_PROGRAMS = 2**40
@@ -112,8 +114,14 @@ def certify_run(
         with workers_for(config, on_notice) as engine:
             number = store.next_certification
             certified = _certify(engine, config, different(chosen), number, episodes, keep, by)
-        store.add_certification([stored(policy) for policy in certified])
+        add_certified(store, certified, on_notice)
     return certified
+
+
+def add_certified(store: RunStore, certified: Sequence[Certified], on_notice: Callable[[str], None]) -> None:
+    """Store a certification in its run, once no other program holds the database."""
+    rows = [stored(policy) for policy in certified]
+    when_free(partial(store.add_certification, rows), telling_once(store.folder, on_notice))
 
 
 @contextmanager
@@ -123,7 +131,7 @@ def opened(run: Run, workers: int | None, on_notice: Callable[[str], None]) -> I
     After an error, the store advises to resume the run; here it is the certification that is repeated.
     """
     try:
-        with RunStore.open(run.folder) as store:
+        with when_free(partial(RunStore.open, run.folder), telling_once(run.folder, on_notice)) as store:
             for notice in store.notices:
                 on_notice(notice)
             yield store, evaluation_config(run, workers)

@@ -94,7 +94,7 @@ def _refusal(store: RunStore, changes: str) -> ConfigError:
 
 
 class Recorder:
-    """The run's store for the loop, which records what computes a generation before it commits the generation."""
+    """Commits the generations of a run, and records before that what has computed them."""
 
     def __init__(
         self,
@@ -117,15 +117,22 @@ class Recorder:
         self._store, self._engine, self._on_notice, self._strict = store, engine, on_notice, strict
         self._driver, self._code = platform, dict(code)
         self._workers: frozenset[str] | None = None
-        self.part = store.part
 
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
+    def workers(self) -> frozenset[str]:
+        """Platforms of the workers that there are now."""
+        return self._engine.platforms
+
+    def commit(
+        self, workers: frozenset[str], generation: int, parts: Changes, history: HistoryRow, evaluations: Table
+    ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 
+        Args:
+            workers: `workers` when the generation was finished.
+
         Raises:
-            ConfigError: the run would become mixed, but `strict` is set.
+            ConfigError: the run would become mixed, but `strict` is set. Otherwise as `RunStore.commit`.
         """
-        workers = self._engine.platforms
         if workers != self._workers:
             platform = {**computed_on(self._driver, workers), CODE: self._code}
             before = self._store.platform_before(generation)
@@ -135,11 +142,11 @@ class Recorder:
                 changes = platform_changes(before, platform)
             if changes and self._strict:
                 raise _refusal(self._store, in_words(changes))
+            self._store.record_platform(generation, platform)
+            self._workers = workers
             if changes:
                 self._on_notice(
                     f"from generation {generation} on, this run is computed on another platform, or on several: "
                     f"{in_words(changes)}. {MIXED}"
                 )
-            self._store.record_platform(generation, platform)
-            self._workers = workers
         self._store.commit(generation, parts, history, evaluations)

@@ -29,6 +29,7 @@ from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
+from es_service.runs.waiting import patient_store
 from es_service.runs.worker_count import work_at_once, worker_count
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
@@ -45,7 +46,8 @@ _LOG = logger(__name__)
 CALLS_S = 60.0
 """Seconds in which the process of a function can be replaced, beside the time of its calls."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
-"""Called with each history row after its generation is committed. A `Stop` that it returns ends the session."""
+"""Called with each history row after its generation is committed, or has begun to wait for that (`runs/waiting.py`). A
+`Stop` that it returns ends the session."""
 OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
@@ -162,7 +164,6 @@ def work(
                 )
 
         def after_generation(row: Mapping[str, Any]) -> object:
-            log(Committed(row["generation"]))
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else counted(lost, "worker")
@@ -183,7 +184,8 @@ def work(
             tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
-        state, reason = driver.run(search, engine, recorder, state, after_generation, tell_failed)
+        with patient_store(store, recorder, should_stop, tell, lambda stored: log(Committed(stored))) as kept:
+            state, reason = driver.run(search, engine, kept, state, after_generation, tell_failed)
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)
     return Outcome(open_run(store.folder), reason)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,6 +24,7 @@ from es_service.runs.checked_config import accepted
 from es_service.runs.resume_checks import columns, require_resumable
 from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, work
 from es_service.runs.view import open_run
+from es_service.runs.waiting import telling_once, when_free
 from es_service.runs.worker_count import require_cores
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
@@ -130,7 +132,8 @@ def _session(
     strict: bool = False,
 ) -> tuple[RunConfig, Outcome]:
     """Open a run, check that the config of this session fits it, and work on it."""
-    with RunStore.open(folder, hook=listener.hook) as store, in_run(store.meta.run_id):
+    opened = when_free(partial(RunStore.open, folder, hook=listener.hook), telling_once(folder, listener.on_notice))
+    with opened as store, in_run(store.meta.run_id):
         # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
         for notice in store.notices:
             listener.on_notice(notice)

@@ -18,7 +18,7 @@ from typing import Any
 from es_service.config.model import RunConfig
 from es_service.loop.interfaces import Stop
 from es_service.protocol.noise import Domain
-from es_service.runs.certification import Named, different, opened, platform_of, workers_for
+from es_service.runs.certification import Named, add_certified, different, opened, platform_of, workers_for
 from es_service.runs.certified import (
     EPISODES,
     Certified,
@@ -28,7 +28,6 @@ from es_service.runs.certified import (
     measure_of,
     passed,
     report_of,
-    stored,
 )
 from es_service.runs.evaluation import candidates
 from es_service.runs.selection import Parameters, new_episodes
@@ -57,7 +56,7 @@ def certify_best(folder: Path, config: RunConfig, on_notice: Callable[[str], Non
 
         policies, number = all_certifications(folder), store.next_certification
         for one in attempt(policies, best, number, target, config.task.fitness, platform_of(local), episodes_of):
-            store.add_certification([stored(one)])
+            add_certified(store, [one], on_notice)
 
 
 def attempt(

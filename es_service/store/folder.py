@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from es_service.errors import StoreError, WayOut
+from es_service.errors import DatabaseHeldError, StoreError, WayOut
 from es_service.protocol.system import mounts, mounts_of_linux
 
 CONFIG = "config.yaml"
@@ -160,10 +160,11 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
             ways_out=ways_out,
         )
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    kind = StoreError
     if code in _BUSY:
-        hint = f"Another program has {folder / DATABASE} open; close that program"
+        kind, hint = DatabaseHeldError, f"Another program has {folder / DATABASE} open; close that program"
     elif code in _NO_ACCESS or isinstance(error, OSError):
         hint = "Check that the folder and its files exist and can be read and written"
     else:
         hint = "Everything stored before is safe; check the disk"
-    return StoreError(f"{folder}: error while {doing}: {error}. {hint}{ending}", run=folder, ways_out=ways_out)
+    return kind(f"{folder}: error while {doing}: {error}. {hint}{ending}", run=folder, ways_out=ways_out)

@@ -203,7 +203,7 @@ def _new_copy(connection: sqlite3.Connection, file: Path) -> Iterator[sqlite3.Co
         remove_database(temporary)
         with closing(connect(temporary)) as copy:
             copy.execute("PRAGMA synchronous = OFF")
-            connection.backup(copy)
+            connection.backup(copy, progress=_refuse_to_wait)
             # The header was copied from a WAL database. Without WAL, readers of the copy write no files beside it.
             copy.execute("PRAGMA journal_mode = DELETE")
             yield copy
@@ -213,6 +213,14 @@ def _new_copy(connection: sqlite3.Connection, file: Path) -> Iterator[sqlite3.Co
     except BaseException:
         remove_database(temporary)
         raise
+
+
+def _refuse_to_wait(status: int, remaining: int, total: int) -> None:
+    """Raise sqlite3.OperationalError if another program holds the database, for which Python would wait without end."""
+    if status in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        error = sqlite3.OperationalError("database is locked")
+        error.sqlite_errorcode = status
+        raise error
 
 
 def _known_rows(connection: sqlite3.Connection, former: Path) -> int:

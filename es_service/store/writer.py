@@ -12,6 +12,7 @@ import contextlib
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +29,7 @@ from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
-from es_service.store.repair import open_sound
+from es_service.store.repair import open_sound, patience
 from es_service.store.rows import history_rows, insert_history
 from es_service.store.schema import SCHEMA, SCHEMA_VERSION, Damaged, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_state, sound_part
@@ -158,7 +159,8 @@ class RunStore:
             evaluations: likewise for the centres that the generation evaluated, in the order of the asks: a table.
 
         Raises:
-            StoreError: the generation is not the next one, the history does not fit the columns, or the disk is full.
+            DatabaseHeldError: another program holds the database. StoreError: the generation is not the next one, the
+                history does not fit the columns, or the disk is full.
         """
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
@@ -205,6 +207,10 @@ class RunStore:
         with self._transaction("recording the platform") as connection:
             self._recorded = True
             return record(connection, generation, platform)
+
+    def patience(self, seconds: float) -> AbstractContextManager[None]:
+        """Context manager in which the store waits so long for another program that holds the database."""
+        return patience(self._connection, seconds)
 
     @property
     def next_certification(self) -> int:

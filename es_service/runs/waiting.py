@@ -1,0 +1,201 @@
+"""The run's store for the loop, in which finished generations wait while another program holds the database.
+
+A viewer of SQLite databases may hold a run for as long as somebody looks at it: with a write transaction on a local
+disk, by reading alone where `run.db` has a rollback journal. That must not end a run of days. Generations are stored in
+their order, each in its transaction, so a process that is killed loses the newest of them, which the next session
+computes again with the same bits.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
+from es_service.loop.history import HistoryRow, Table
+from es_service.loop.parts import Changes
+from es_service.runs.identity import Recorder
+from es_service.store.folder import DATABASE
+from es_service.store.writer import RunStore
+
+MOST_BYTES = 256 * 2**20
+"""The run pauses when its waiting generations have more bytes than this."""
+PATIENCE_S = 1.0
+"""Seconds for which a commit waits before its generation waits in memory, and after which a run that has paused looks
+again for a request to stop."""
+AGAIN_S = 0.5
+"""Least seconds between two attempts to store what waits in memory."""
+
+Result = TypeVar("Result")
+
+
+def when_free(act: Callable[[], Result], held: Callable[[], object]) -> Result:
+    """What `act` returns when no other program holds the database; `held` is called before each further attempt."""
+    while True:
+        try:
+            return act()
+        except DatabaseHeldError:
+            held()
+
+
+def telling_once(folder: Path, tell: Callable[[str], None]) -> Callable[[], None]:
+    """Function for `when_free` that gives a notice at its first call."""
+    told: list[str] = []
+
+    def held() -> None:
+        if not told:
+            told.append(f"another program holds {folder / DATABASE}; close it. This pauses until then")
+            tell(told[0])
+
+    return held
+
+
+class PatientStore:
+    """Commits generations as soon as the database can be written; `patient_store` makes one."""
+
+    def __init__(
+        self,
+        store: RunStore,
+        recorder: Recorder,
+        should_stop: Callable[[], int | None],
+        tell: Callable[[str], None],
+        on_commit: Callable[[int], object],
+    ) -> None:
+        """Hold nothing yet. `on_commit` is called with each generation that has been committed; `tell` with notices."""
+        self._store, self._recorder = store, recorder
+        self._should_stop, self._tell, self._on_commit = should_stop, tell, on_commit
+        self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table]]] = deque()
+        self._parts: dict[str, Mapping[str, np.ndarray] | None] = {}
+        """What they have changed of the state, the newest of each part."""
+        self._bytes, self._again_s, self._is_held = 0, 0.0, False
+        self._told: set[str] = set()
+
+    def part(self, name: str) -> Mapping[str, np.ndarray]:
+        """One part of the state after the newest generation that was given.
+
+        Raises:
+            Interrupted: a stop was requested while it could not be read. Otherwise as `RunStore.part`.
+        """
+        if name not in self._parts:
+            return when_free(partial(self._store.part, name), self._pause)
+        if (arrays := self._parts[name]) is None:
+            raise KeyError(name)
+        return arrays
+
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
+        """Store a generation, or let it wait in memory while another program holds the database.
+
+        Raises:
+            Interrupted: so many generations wait that the run has paused, and a stop was requested. Otherwise as
+                `Recorder.commit`.
+        """
+        arrays = [array for part in (*parts.values(), evaluations) if part is not None for array in part.values()]
+        size = sum(array.nbytes for array in arrays)
+        is_first = not self._waiting
+        self._waiting.append((size, self._recorder.workers(), (generation, parts, history, evaluations)))
+        self._parts.update(parts)
+        self._bytes += size
+        if is_first or time.monotonic() >= self._again_s:
+            self.store_waiting(PATIENCE_S if is_first else 0.0)
+        while self._bytes > MOST_BYTES and not self.store_waiting(PATIENCE_S):
+            self._pause()
+
+    def store_waiting(self, patience_s: float) -> bool:
+        """Store what waits, the oldest first; return whether nothing waits any longer."""
+        try:
+            with self._store.patience(patience_s):
+                while self._waiting:
+                    size, workers, generation = self._waiting[0]
+                    self._recorder.commit(workers, *generation)
+                    self._waiting.popleft()
+                    self._bytes -= size
+                    self._on_commit(generation[0])
+        except DatabaseHeldError:
+            self._hold()
+            return False
+        self._parts.clear()
+        if self._is_held:
+            self._is_held = False
+            self._store.lock.say()
+            self._say(f"{self._file} can be written again, and everything that waited is stored")
+        return True
+
+    def finish(self) -> None:
+        """Return when nothing waits. Raises Interrupted if a stop was requested before that."""
+        while not self.store_waiting(PATIENCE_S):
+            self._pause()
+
+    def lost(self) -> DatabaseHeldError:
+        """The error of a session that ends while generations wait."""
+        generations = [generation for _, _, (generation, *_) in self._waiting]
+        which = f"generation {generations[0]}" if len(generations) == 1 else f"{len(generations)} generations"
+        return DatabaseHeldError(
+            f"another program holds {self._file}, so {which} could not be stored before the end; close that program. "
+            "What is lost is computed again with the same results when the run continues",
+            run=self._store.folder,
+            ways_out=[WayOut("resume", "continue after the program is closed", str(self._store.folder))],
+        )
+
+    @property
+    def _file(self) -> str:
+        return str(self._store.folder / DATABASE)
+
+    def _pause(self) -> None:
+        """Pause until the next attempt to use the database. Raises Interrupted if a stop was requested."""
+        self._hold()
+        self._say(f"the run pauses until no other program holds {self._file}")
+        if (number := self._should_stop()) is not None:
+            raise Interrupted(number)
+
+    def _hold(self) -> None:
+        """Say that the database is held, to the user once and to readers of the run's status each time."""
+        self._is_held, self._again_s = True, time.monotonic() + AGAIN_S
+        count = len(self._waiting)
+        self._store.lock.say(doing=f"another program holds {DATABASE}; finished generations that wait: {count:,}")
+        self._say(
+            f"another program holds {self._file}, which cannot be written. Finished generations wait in memory, at "
+            f"most {MOST_BYTES // 2**20} MB of them; then the run pauses. Close that program: what waits is lost if "
+            "this process is killed, and computed again when the run continues"
+        )
+
+    def _say(self, notice: str) -> None:
+        """Give a notice, once in a session."""
+        if notice not in self._told:
+            self._told.add(notice)
+            self._tell(notice)
+
+
+@contextmanager
+def patient_store(
+    store: RunStore,
+    recorder: Recorder,
+    should_stop: Callable[[], int | None],
+    tell: Callable[[str], None],
+    on_commit: Callable[[int], object],
+) -> Iterator[PatientStore]:
+    """Context manager with the store for a session, after which everything is stored, however long that takes.
+
+    Raises:
+        DatabaseHeldError: the session was interrupted, and another program still holds the database. If another error
+            ends the session, that is raised, and a notice says what could not be stored.
+    """
+    patient = PatientStore(store, recorder, should_stop, tell, on_commit)
+    try:
+        yield patient
+        patient.finish()
+    except (StoreError, ConfigError):
+        raise  # of a commit, which would fail again
+    except BaseException as error:
+        if patient.store_waiting(PATIENCE_S):
+            raise
+        if isinstance(error, Interrupted | KeyboardInterrupt):
+            raise patient.lost() from error
+        tell(patient.lost().sentence)
+        raise
