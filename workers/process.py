@@ -14,7 +14,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -127,6 +127,8 @@ def _serve(parent: socket.socket, made: Future[Compilable | RaisedError], spec: 
     subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
     parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
     compiled: set[str] = set()
+    # Threads of one process would report the progress of others, and hide one that hangs.
+    progress_of_item = nullcontext if BACKENDS[spec.rollout].runs_in_threads else said.progress
     while True:
         match receive(parent):
             case ("subject", number, subject):
@@ -135,7 +137,7 @@ def _serve(parent: socket.socket, made: Future[Compilable | RaisedError], spec: 
                 parents.receive(given)
             case ("chunks", item, attempt, chunks):
                 try:
-                    with said.progress():
+                    with progress_of_item():
                         work = parents.complete([(subjects[number], chunk) for number, chunk in chunks])
                         if (kind := type(work[0][1]).__name__) not in compiled:
                             seconds = run_chunks.seconds_to_compile(work)
