@@ -35,8 +35,13 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
     task = describe_environment(name, settings)
     options = option_values(task.options, settings.get("options", {}))
     able = {name: backend for name, backend in BACKENDS.items() if task.kind in backend.task_kinds}
-    reasons = {name: why for name, backend in able.items() if (why := backend.examine(task, options))}
-    return dataclasses.replace(task, unsupported=reasons)
+    examined = {name: backend.examine(task, options) for name, backend in able.items()}
+    return dataclasses.replace(
+        task,
+        unsupported={name: found.unsupported for name, found in examined.items() if found.unsupported},
+        hidden={name: found.hidden for name, found in examined.items() if found.hidden},
+        notes=(*task.notes, *(note for found in examined.values() for note in found.notes)),
+    )
 
 
 def main(name: str, settings: str = "{}") -> None:

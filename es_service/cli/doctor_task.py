@@ -34,6 +34,8 @@ def task_findings(name: str) -> Iterator[Finding]:
     yield "ok", f"its descriptor is {', '.join(shown)}"
     for note in task.notes:
         yield "note", note
+    for rollout, where in task.hidden.items():
+        yield "FAIL", f"{where}; {rollout} computes 0 for such a product, so no run would notice"
     if task.kind == "jax":
         yield "ok", "its steps are pure functions that JAX traces, so they repeat; `bench rollouts` measures them"
         return

@@ -37,6 +37,7 @@ from es_service.config.problems import nearest, not_allowed, one_of, problem_of,
 from es_service.config.resolution import (
     LEFT_OPEN,
     engine_problems,
+    hidden_problems,
     is_idle,
     policy_problems,
     resolve,
@@ -229,7 +230,7 @@ def _load(
         problems += _idle_problems(idle, values, algorithms, task) + method_problems(values, settings)
         problems += start_problems(values, settings) if new else []
     problems += rollout_problems(values, task, rollouts) + shape_problems(values) + engine_problems(values, rollouts)
-    problems += folder_problems(values) if new else []
+    problems += folder_problems(values) + hidden_problems(values, task, rollouts) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
     if problems or settings is None:

@@ -324,6 +324,20 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
     return [problem_of("compute.rollout", name, f"{why}; must be {allowed}", allowed=allowed)]
 
 
+def hidden_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts: Rollouts) -> list[Problem]:
+    """The problem of a task of which the rollout computes numbers where the task itself is not finite."""
+    name = values.get("compute.rollout", "")
+    if task is None or not (hidden := task.hidden.get(name)):
+        return []
+    others = [other for other, it in rollouts.items() if task.kind in it.task_kinds and other not in task.hidden]
+    what = (
+        f"{hidden}. With {name} such a product is 0, and nobody would notice; choose the argument before it is "
+        "computed, as in jnp.log(jnp.where(x > 0.0, x, 1.0))"
+    )
+    instead = f", or set compute.rollout to {one_of(others)}, which finds such episodes invalid" if others else ""
+    return [problem_of("task.environment", task.name, f"{task.name}: {what}{instead}")]
+
+
 def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> list[str]:
     """Warnings about settings that are valid but probably not intended; the command line prints them before the run."""
     shape, here, names = policy_spec(config, task), config.compute.address is None, [*rollouts]

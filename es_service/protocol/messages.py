@@ -77,6 +77,9 @@ class TaskSpec:
     """Which episodes succeed, in words; empty if the task does not say."""
     unsupported: dict[str, str] = field(default_factory=dict)
     """Rollouts that were found to be unable to compute episodes of this task, by name, each with the reason."""
+    hidden: dict[str, str] = field(default_factory=dict)
+    """Rollouts that compute a number where the task as JAX defines it was found not to be finite, by name, each with
+    the sentence that says where."""
     kind: TaskKind = "jax"
     """What the task is made of, on which it depends which rollouts can compute it."""
     discrete_actions: bool = False

@@ -107,8 +107,12 @@ def _frames(error: BaseException, packages: set[str]) -> list[str]:
     return lines
 
 
+def is_users_file(file: str) -> bool:
+    """Whether a file is neither of this project nor of a library, by its name."""
+    return not file.startswith(_HIDDEN) and not set(Path(file).parts) & set(SHARED_FOLDERS)
+
+
 def _is_users(frame: FrameType, packages: set[str]) -> bool:
-    file = frame.f_code.co_filename
     if str(frame.f_globals.get("__name__")).partition(".")[0] in packages:
         return True
-    return not file.startswith(_HIDDEN) and not set(Path(file).parts) & set(SHARED_FOLDERS)
+    return is_users_file(frame.f_code.co_filename)

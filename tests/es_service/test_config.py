@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from es_service.config.changes import changed_constants
 from es_service.config.keys import FIELDS
-from es_service.config.loading import load_config
+from es_service.config.loading import changed_config, load_config
 from es_service.config.methods import all_search_fields
 from es_service.config.model import worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
@@ -173,6 +173,22 @@ def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert warning == "compute.rollout: xla is used because simd cannot run point_maze: the primitive sort"
     with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the primitive sort; must be auto or xla"):
         load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
+
+
+def test_a_new_run_is_refused_if_its_rollout_would_hide_what_is_not_finite():
+    where = "its reward is NaN in step 1 with actions of 0: my_maze.py:7 (step) multiplies by 0 what is not finite"
+    of = {"tasks": {"point_maze": replace(POINT_MAZE, hidden={"simd": where})}}
+    of |= {"algorithms": ALGORITHMS, "rollouts": BACKENDS}
+    with pytest.raises(
+        ConfigError, match=r"or set compute.rollout to xla, which finds such episodes invalid"
+    ) as caught:
+        load_config(MINIMAL, **of)
+    (problem,) = caught.value.problems
+    assert problem.field == "task.environment"
+    assert problem.sentence.startswith(f"task.environment: point_maze: {where}. With simd such a product is 0")
+    assert load_config(MINIMAL, ("compute.rollout=xla",), **of).compute.rollout == "xla"
+    stored = yaml.safe_load(load().resolved_yaml())
+    assert changed_config(stored, **of).compute.rollout == "simd", "a run that exists goes on and can be evaluated"
 
 
 def test_threads_are_for_simd_inside_one_process():

@@ -12,6 +12,7 @@ from es_service.cli.doctor import print_findings
 from es_service.cli.doctor_task import task_findings
 from es_service.errors import ConfigError
 from es_service.protocol.noise import uniforms
+from es_service.runs.checked_config import load_config
 
 MODULE = "tests.workers.host_tasks"
 
@@ -71,6 +72,15 @@ def test_what_has_no_effect_is_noted_and_a_run_notes_it_once(tmp_path, one_proce
     assert notices == [note]
     api.resume(folder, {"budget.generations": 2}, on_notice=notices.append)
     assert notices == [note]
+
+
+@pytest.mark.slow
+def test_what_simd_would_hide_is_a_failure_and_refused_before_a_run():
+    name = "tests.workers.simd.test_trial:HiddenReward"
+    ((_, failure),) = ((level, sentence) for level, sentence in findings(name) if level == "FAIL")
+    assert failure.startswith("its reward is NaN in step 1 with actions of 0: what ")
+    with pytest.raises(ConfigError, match=r"HiddenReward: its reward is NaN .*test_trial.py:.* multiplies it by 0"):
+        load_config({"task": {"environment": name}, "search": {"algorithm": "es"}, "budget": {"generations": 1}})
 
 
 @pytest.mark.slow

@@ -82,6 +82,17 @@ def lane_of(error: BaseException) -> int | None:
     return getattr(error, _LANE, None)
 
 
+class Examination(NamedTuple):
+    """What a rollout finds of a task that is no shipped one, in sentences; empty where there is nothing to say."""
+
+    unsupported: str = ""
+    """Reason why it cannot compute its episodes."""
+    hidden: str = ""
+    """Where it computes a number and JAX, which defines the task, has NaN or an infinity."""
+    notes: tuple[str, ...] = ()
+    """What its author probably did not intend."""
+
+
 class ChunkFunctions(NamedTuple):
     """How a worker computes the chunks of a run; several threads may call these functions if the rollout declares so.
 
@@ -109,13 +120,13 @@ class ChunkFunctions(NamedTuple):
 class RolloutBackend(Rollout, Protocol):
     """A rollout, as the processes see it that compute with it. They import JAX only if these functions do."""
 
-    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
-        """Reason why it cannot compute episodes of a task that is no shipped one with these options; empty if it can.
+    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> Examination:
+        """What it finds of a task that is no shipped one with these options.
 
-        Called where the task is described, in a process of its own; the answer is kept in `TaskSpec.unsupported`, so
-        that the driver need not find it.
+        Called where the task is described, in a process of its own; the answer is kept in the `TaskSpec`, so that the
+        driver need not find it.
         """
-        return ""
+        return Examination()
 
     def device(self) -> str:
         """Kind of the GPU that it computes on, which belongs to a worker's platform; called only where there is one."""

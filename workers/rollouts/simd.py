@@ -12,7 +12,7 @@ from es_service.protocol.process_environment import on_gpu
 from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
-from workers.rollouts.backend import ChunkFunctions, RolloutBackend
+from workers.rollouts.backend import ChunkFunctions, Examination, RolloutBackend
 
 
 class Simd(RolloutBackend):
@@ -45,11 +45,11 @@ class Simd(RolloutBackend):
             return str(error)
         return ""
 
-    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
-        """Why the task's steps cannot be compiled."""
-        from workers.simd.episodes.rollout import why_not
+    def examine(self, task: TaskSpec, options: Mapping[str, OptionValue]) -> Examination:
+        """Why the task's steps cannot be compiled, and what a short trial of them finds."""
+        from workers.simd.episodes.trial import examine
 
-        return why_not(task, options)
+        return examine(task, options)
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.simd.episodes.rollout`."""

@@ -45,7 +45,7 @@ def check_kernel(kernel: Kernel, graph: Graph, outputs: list[int], given_L: np.n
     words = pack([given_L], kernel.target.width)
     results = aligned((len(words), kernel.words_out, kernel.target.width))
     kernel.run(words, results)
-    require_same(_by_lane(results), _words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
+    require_same(_by_lane(results), as_words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
 
 
 def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
@@ -77,7 +77,7 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     x_I_L = np.stack(evaluate(normalised_observation, seen, np.concatenate([carry_L, *statistics])))
     action_A_L = reference.policy(spec.policy, inputs_O, x_I_L, weights_of, **moved)
     words = np.concatenate([carry_L, statistics[0], action_A_L.view(np.uint32), keys_L.T])
-    require_same(_by_lane(carries), _words(evaluate(advance, after, words)), f"a step of {spec.environment}")
+    require_same(_by_lane(carries), as_words(evaluate(advance, after, words)), f"a step of {spec.environment}")
 
 
 def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> None:
@@ -148,6 +148,6 @@ def _by_lane(carries: Words) -> np.ndarray:
     return np.concatenate(list(carries), axis=1)[:, :LANES].copy()
 
 
-def _words(values: list[np.ndarray]) -> np.ndarray:
+def as_words(values: list[np.ndarray]) -> np.ndarray:
     """Values of outputs as words; a bool is 0 or 1."""
     return np.stack([x.astype(np.uint32) if x.dtype == bool else x.view(np.uint32) for x in values])

@@ -26,7 +26,7 @@ from workers.simd.backend.words import aligned, require
 from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
-from workers.simd.episodes.program import write_episodes
+from workers.simd.episodes.program import EpisodeProgram, write_episodes
 from workers.simd.episodes.variation import make_variation
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.unsupported import UnsupportedError, fault
@@ -44,11 +44,25 @@ def why_not(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType(
     Args:
         given: values of options; the others have their defaults.
     """
-    options = option_values(task.options, given)
+    try:
+        training_program(task, option_values(task.options, given)).text()
+    except UnsupportedError as error:
+        return str(error)
+    except Exception as error:  # also after a fault of the compiler, xla can run the task
+        return fault(error)
+    return ""
+
+
+def training_program(task: TaskSpec, options: Mapping[str, OptionValue]) -> EpisodeProgram:
+    """The program of a task's training episodes with a small policy.
+
+    Raises:
+        UnsupportedError: a step of the task cannot be compiled.
+    """
     spec = WorkerSpec(
         seed=0,
         environment=task.name,
-        environment_options=options,
+        environment_options=dict(options),
         policy=PolicySpec((task.observation_size, task.action_size)),
         episode_steps=task.episode_steps,
         fitness="sum",
@@ -62,13 +76,7 @@ def why_not(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType(
         rollout="simd",
     )
     environment, inputs_O = make_environment(task.name, options), np.arange(task.observation_size)
-    try:
-        write_episodes(environment, spec, inputs_O, target_of("avx2"), training=True).text()
-    except UnsupportedError as error:
-        return str(error)
-    except Exception as error:  # also after a fault of the compiler, xla can run the task
-        return fault(error)
-    return ""
+    return write_episodes(environment, spec, inputs_O, target_of("avx2"), training=True)
 
 
 def make_training_rollout(

@@ -15,16 +15,19 @@ from workers.simd.graph.unsupported import refusing
 
 
 @refusing()
-def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
+def trace_jaxpr(closed: ClosedJaxpr, *, folds_zeros: bool = True) -> tuple[FoldingGraph, int, list[int]]:
     """Graph of a function of one lane, as (graph, number of input words, output nodes).
 
     Each element of each input array is an input of the graph, in order, and each element of each output array an
     output.
 
+    Args:
+        folds_zeros: see `FoldingGraph`.
+
     Raises:
         UnsupportedError: the function cannot be compiled.
     """
-    graph = FoldingGraph()
+    graph = FoldingGraph(folds_zeros=folds_zeros)
     words = itertools.count()
     inputs = []
     for variable in closed.jaxpr.invars:

@@ -7,7 +7,7 @@ kernel nothing. Arithmetic adds nodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax.extend import source_info_util
@@ -25,6 +25,14 @@ Rule = Callable[..., Any]
 """Rule of a primitive for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of arrays."""
 GRAPH_LIMIT = 2_000_000
 """Most nodes of a graph; a greater one would take too long to compile."""
+
+
+class Place(NamedTuple):
+    """Where an equation comes from."""
+
+    source: source_info_util.SourceInfo
+    outer: Place | None
+    """The equation whose function contains it."""
 
 
 class Tracer:
@@ -46,7 +54,9 @@ class Tracer:
             aval: Any = atom.aval
             return self.constants(np.asarray(atom.val, aval.dtype)) if isinstance(atom, Literal) else values[atom]
 
+        outer = self.graph.place
         for equation in jaxpr.eqns:
+            self.graph.place = Place(equation.source_info, outer)
             rule = self.rules.get(equation.primitive.name)
             try:
                 if rule is None:
@@ -71,6 +81,7 @@ class Tracer:
                 dtypes = {self.graph.dtypes[node] for node in nodes.reshape(-1).tolist()}
                 assert dtypes <= {graph_dtype(aval.dtype)}, (equation.primitive.name, dtypes, aval)
                 values[variable] = nodes
+        self.graph.place = outer
         return [read(atom) for atom in jaxpr.outvars]
 
     def constants(self, numbers: Any) -> Nodes:

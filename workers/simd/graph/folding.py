@@ -32,6 +32,11 @@ from workers.simd.graph.operations import OPERATIONS, compute
 class FoldingGraph(Graph):
     """A graph whose `op` may return a simpler node with the same value; tracing builds this graph."""
 
+    def __init__(self, *, folds_zeros: bool = True) -> None:
+        """`folds_zeros`: whether x * 0 is 0, which is the only rule that replaces what is not finite by a number."""
+        super().__init__()
+        self.folds_zeros = folds_zeros
+
     def build(self, name: str, arguments: tuple[int, ...]) -> int:
         """Node of an operation that does not exist yet, or of a constant or simpler operation with the same value."""
         values = [self.constant(a) for a in arguments]
@@ -86,7 +91,7 @@ def _fold_mul(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int 
             return x
         if _is(value, -1.0):
             return g.op("neg", x)
-        if _is(value, 0.0):
+        if _is(value, 0.0) and g.folds_zeros:
             return g.f(0.0)
     minus_a, minus_b = g.negated(a), g.negated(b)
     if minus_a is not None and minus_b is not None:

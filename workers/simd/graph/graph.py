@@ -45,6 +45,10 @@ class Graph:
         self.keys: list[Key] = []
         self.dtypes: list[str] = []
         self.loops: list[Loop] = []
+        self.place: Any = None
+        """Where the nodes that are added next come from, as whoever adds them says."""
+        self.places: list[Any] = []
+        """`place` when each node was added."""
         self._known: dict[Key, int] = {}
 
     def const(self, dtype: str, value: float | int | bool) -> int:
@@ -128,6 +132,7 @@ class Graph:
             known = self._known[key] = len(self.keys)
             self.keys.append(key)
             self.dtypes.append(dtype)
+            self.places.append(self.place)
         return known
 
 

@@ -20,7 +20,7 @@ def evaluate(
     graph: Graph,
     outputs: Sequence[int],
     words: np.ndarray,
-    seen: Callable[[int, Sequence[Any]], None] = lambda node, arguments: None,
+    operation: Callable[[int, Sequence[Any]], Any] | None = None,
     *,
     fuse: bool = True,
 ) -> list[np.ndarray]:
@@ -28,10 +28,12 @@ def evaluate(
 
     Args:
         words: uint32 [input word, lane].
-        seen: told of every operation and its arguments, each time it is computed.
+        operation: function (node, arguments) -> result of an operation that is not fused, each time it is computed;
+            None for the results with the bits of kernels.
         fuse: products with their sums, as kernels do.
     """
     order = schedule(graph, outputs)
+    operation = operation or (lambda node, arguments: compute_operation(graph.keys[node][0], arguments))
     values: dict[int, np.ndarray] = {}
     given: dict[int, np.ndarray] = {}
 
@@ -51,9 +53,8 @@ def evaluate(
     def computed(node: int) -> np.ndarray:
         product = order.fused.get(node) if fuse else None
         arguments = [value(argument) for argument in graph.arguments(node)]
-        seen(node, arguments)
         if product is None:
-            return compute_operation(graph.keys[node][0], arguments)
+            return operation(node, arguments)
         left, right = graph.arguments(node)
         a, b = (value(argument) for argument in graph.arguments(product))
         if graph.keys[node][0] == "sub" and product == right:
