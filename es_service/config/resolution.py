@@ -200,6 +200,10 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if (noise := values.get("search.noise.kind", "full")) != "full" and task.parameters is not None:
         why = f" for {task.name}, whose parameters are no matrices"
         problems.append(not_allowed("search.noise.kind", noise, "full", why=why))
+    if task.kind == CALLER and (target := values.get("budget.target_certified")) is not None:
+        why = f" for {task.name}, of which no new episodes can be run"
+        hint = "; budget.target_fitness ends the run at a value of the episodes that the caller computes"
+        problems.append(not_allowed("budget.target_certified", target, "null", why=why, hint=hint))
     if task.kind == CALLER and task.parameters is None:
         sizes = (values.get(f"{TASK_OPTIONS}{name}") for name in ("observation_size", "action_size"))
         if 0 in sizes:

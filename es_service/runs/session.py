@@ -180,7 +180,7 @@ def work(
             in_generation(row["generation"] + 1)
             return answer
 
-        if compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
+        if caller is None and compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
             tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+from es_service.config.caller import CALLER
 from es_service.config.changes import again_with
 from es_service.config.compute import ENGINE_IMPLIES, implied_by
 from es_service.config.fields import RESOURCES
@@ -47,12 +48,14 @@ def work_at_once(config: RunConfig) -> int:
 
 def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
     """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run, or than its
-    GPUs have room for.
+    GPUs have room for. Nothing is refused if no worker starts, because the caller computes the episodes.
 
     Args:
         again: the call that asks for the workers, which ways out repeat with other settings.
     """
     compute, count = config.compute, cores()
+    if config.task.environment == CALLER:
+        return
     if compute.engine == "inline" and compute.worker_resources.gpu:
         _require_gpus(config)
     if compute.workers == "auto" or compute.address is not None:

@@ -324,6 +324,33 @@ def test_episodes_without_a_size_or_with_too_large_a_one_are_refused(options, fi
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_target_that_only_new_episodes_can_confirm_is_refused_before_a_run_begins(method, tmp_path):
+    """The first best centre that reached it would end every session: no episodes can be run for the caller."""
+    config = config_of(method, budget={"generations": 3, "target_certified": -10})
+    with (
+        pytest.raises(
+            ConfigError, match=r"target_certified: -10 is not allowed for caller.*budget\.target_fitness"
+        ) as at,
+        ask_tell(config, tmp_path / "run"),
+    ):
+        pass
+    assert at.value.problems[0].field == "budget.target_certified"
+    assert not (tmp_path / "run").exists()
+    reached = finished(config_of(method, budget={"generations": 3, "target_fitness": -1000}), tmp_path / "other")
+    assert reached.generation == 0
+
+
+def test_no_worker_is_counted_or_missed_where_the_caller_computes(tmp_path):
+    notices: list[str] = []
+    config = config_of("es", compute={"engine": "inline", "workers": 1000})
+    with ask_tell(config, tmp_path / "run", on_notice=notices.append) as search:
+        assert search.ask() is not None
+    with ask_tell(config, tmp_path / "run", on_notice=notices.append) as search:
+        assert search.ask() is not None
+    assert notices == []
+
+
 def test_the_examples_are_what_they_say(tmp_path):
     assert len(late_answers.search(tmp_path / "late").map) > 8
     assert np.isfinite(own_loop.search(tmp_path / "loop").history["best_fitness"]).all()
