@@ -143,7 +143,8 @@ class MapConfig(Section):
     )
     qd_offset: Number = Field(
         description="Fitness that counts as 0 in the QD-score. auto: the lowest reward of the task, times the steps of "
-        "an episode with fitness sum; 0 if the task specifies no lowest reward."
+        "an episode with fitness sum; 0 if the task specifies no lowest reward: elites of negative fitness then lower "
+        "the score as the map fills; reports also draw it from the least fitness evaluated."
     )
     correct_every: Count | None = Field(
         None,

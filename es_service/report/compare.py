@@ -27,7 +27,11 @@ COLUMNS = {
     "best_fitness": ("Best fitness so far", "Highest mean fitness of an evaluated centre.", False),
     "goal_distance": ("Distance to the goal", "Mean over the evaluation episodes of the newest centre.", False),
     "coverage": ("Coverage of the behaviour map", "Filled cells as a share of all cells.", True),
-    "qd_score": ("QD-score", "Sum over all elites of fitness less map.qd_offset.", False),
+    "qd_score": (
+        "QD-score",
+        "Sum over all elites of fitness less map.qd_offset; an elite below that offset lowers it.",
+        False,
+    ),
 }
 """History column -> title, explanation, whether it is a fraction."""
 LABELS = {

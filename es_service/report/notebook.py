@@ -34,7 +34,11 @@ def _page(data: RunData) -> str:
     problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
     sections, points = [tag("section", *said, *problems, id="what")], []
     if data.history["generation"].size:
-        charts = [chart for chart in series.charts(data.history, data.centres) if chart.title in SHOWN]
+        charts = [
+            chart
+            for chart in series.charts(data.history, data.centres, data.constants["map.qd_offset"])
+            if chart.title in SHOWN
+        ]
         shown, points = curves.draw_charts(charts, {"generation": series.x_axes(data.history)["generation"]})
         if data.map is not None and data.map.size:
             figure, explanation, _ = maps.draw_map(data)

@@ -126,7 +126,10 @@ def _head(data: RunData) -> Markup:
 
 
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
-    charts, axes = series.charts(data.history, data.centres), series.x_axes(data.history)
+    charts, axes = (
+        series.charts(data.history, data.centres, data.constants["map.qd_offset"]),
+        series.x_axes(data.history),
+    )
     figures, scripts["charts"] = curves.draw_charts(charts, axes)
     generations = data.history["generation"].size
     together = series.groups(generations)[0]

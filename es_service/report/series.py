@@ -62,7 +62,9 @@ class _Spec(NamedTuple):
     percent: bool = False
 
 
-# {evaluated} is what `evaluated_word` says of the newest generation.
+QD_ABOVE_LEAST = "qd_score_above_least"
+"""Column of `qd_columns`."""
+# {evaluated} is what `evaluated_word` says of the newest generation, {below} what `qd_columns` says.
 _SPECS = (
     _Spec(
         "Fitness",
@@ -94,8 +96,12 @@ _SPECS = (
     ),
     _Spec(
         "QD-score",
-        "Sum over all elites of fitness less map.qd_offset. Corrected: of their means in new episodes.",
-        (("QD-score", "qd_score", "last"), ("corrected", "corrected_qd_score", "held")),
+        "Sum over all elites of fitness less map.qd_offset{below}. Corrected: of their means in new episodes.",
+        (
+            ("QD-score", "qd_score", "last"),
+            ("above the least fitness", QD_ABOVE_LEAST, "last"),
+            ("corrected", "corrected_qd_score", "held"),
+        ),
     ),
     _Spec(
         "Novelty of the {evaluated}",
@@ -121,10 +127,15 @@ _SPECS = (
 )
 
 
-def charts(history: Columns, centres: Columns) -> list[Chart]:
-    """The charts of a run that have values, from the columns of its history and of its evaluated centres."""
+def charts(history: Columns, centres: Columns, qd_offset: float) -> list[Chart]:
+    """The charts of a run that have values, from the columns of its history and of its evaluated centres.
+
+    Args:
+        qd_offset: `map.qd_offset`.
+    """
     ends_K = groups(len(history["generation"]))
-    history = {**history, **weight_columns(history["generation"], centres)}
+    of_map, below = qd_columns(history, centres, qd_offset)
+    history = {**history, **weight_columns(history["generation"], centres), **of_map}
     newest = {name: values_G[-1] for name, values_G in history.items() if values_G.size}
     word = evaluated_word(newest) if newest else "centre"
     chart_list = []
@@ -141,9 +152,30 @@ def charts(history: Columns, centres: Columns) -> list[Chart]:
             label, low, high = spec.band
             band = (label, thinned(history[low], ends_K, "mean"), thinned(history[high], ends_K, "mean"))
         chart_list.append(
-            Chart(spec.title.format(evaluated=word), spec.note.format(evaluated=word), lines, band, spec.percent)
+            Chart(
+                spec.title.format(evaluated=word),
+                spec.note.format(evaluated=word, below=below),
+                lines,
+                band,
+                spec.percent,
+            )
         )
     return chart_list
+
+
+def qd_columns(history: Columns, centres: Columns, qd_offset: float) -> tuple[Columns, str]:
+    """The QD-score counted from the least fitness that was evaluated, which does not fall as cells fill, and what is to
+    be said of the stored one; nothing unless a fitness was below the offset.
+
+    The offset is 0 for a task that specifies no lowest reward. An elite below it then lowers the stored score, although
+    the map has grown.
+    """
+    fitness_N = centres.get("fitness_mean", np.zeros(0))
+    least = float(fitness_N[np.isfinite(fitness_N)].min(initial=np.inf))
+    if "qd_score" not in history or least >= qd_offset:
+        return {}, ""
+    below = f" = {qd_offset:g}, so an elite below that lowers it; the other curve counts from {least:.6g}, the "
+    return {QD_ABOVE_LEAST: history["qd_score"] + history["map_cells"] * (qd_offset - least)}, f"{below}least evaluated"
 
 
 def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Columns:

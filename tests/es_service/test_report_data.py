@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from es_service.cli.main import app
 from es_service.errors import StoreError
 from es_service.protocol.machine import CODE, code_text
 from es_service.report import facts, series, settings
@@ -102,7 +104,7 @@ def test_generation_0_alone_is_shown(tmp_path):
     data = read_run(write_run(tmp_path / "begun", generations=0, filled=0.01))
     assert "Only the initial centres were evaluated" in facts.verdict(data)
     assert "before any update" in facts.verdict(data)
-    assert series.charts(data.history, data.centres)[0].title == "Fitness"
+    assert series.charts(data.history, data.centres, 0.0)[0].title == "Fitness"
 
 
 def test_curves_of_long_runs_are_groups_of_generations():
@@ -163,12 +165,41 @@ def test_what_all_centres_climb_is_drawn_if_it_differs(weights, title, lines):
     columns = dict(zip(("generation", "fitness_weight", "update_norm"), np.array(rows).T, strict=True))
     history = {"generation": np.arange(len(weights) + 1.0), "fitness_weight": np.ones(len(weights) + 1)}
     history["update_norm"] = np.ones(len(weights) + 1)
-    charts = series.charts(history, columns)
+    charts = series.charts(history, columns, 0.0)
     assert [chart.title for chart in charts] == ([] if title is None else [title])
     found = {line.label: line.y_K for chart in charts for line in chart.lines}
     assert found.keys() == lines.keys()
     for label, expected in lines.items():
         np.testing.assert_allclose(found[label], [np.nan, *expected])
+
+
+def test_a_score_that_falls_as_the_map_fills_is_told_and_one_that_counts_from_the_least_fitness_is_drawn():
+    """A cell of fitness -9, then one of -4, which a task without a lowest reward counts from 0. The least evaluated is
+    -10, of a centre that entered no cell: the map is worth 1, then 1 + 6, then 1 + 8 after -2 has replaced -4."""
+    centres = {name: np.zeros(0) for name in ("generation", "fitness_weight", "update_norm")}
+    centres["fitness_mean"] = np.array([-9.0, -10.0, np.nan, -4.0, -2.0])
+    history = {"generation": np.arange(3.0), "qd_score": np.array([-9.0, -13.0, -11.0])}
+    history |= {"map_cells": np.array([1.0, 2.0, 2.0]), "update_norm": np.ones(3)}
+    [chart] = series.charts(history, centres, 0.0)
+    assert {line.label: line.y_K.tolist() for line in chart.lines} == {
+        "QD-score": [-9.0, -13.0, -11.0],
+        "above the least fitness": [1.0, 7.0, 9.0],
+    }
+    assert (
+        "map.qd_offset = 0, so an elite below that lowers it; the other curve counts from -10, the least" in chart.note
+    )
+    [chart] = series.charts(history | {"qd_score": np.array([1.0, 7.0, 9.0])}, centres, -10.0)
+    assert [line.label for line in chart.lines] == ["QD-score"]
+    assert "lowers" not in chart.note
+
+
+def test_status_says_that_elites_below_the_offset_lower_the_score(tmp_path):
+    said = {
+        offset: CliRunner().invoke(app, ["status", str(write_run(tmp_path / name, {"map.qd_offset": offset}))]).stdout
+        for name, offset in (("zero", 0.0), ("least", -1e6))
+    }
+    assert "which elites below map.qd_offset = 0 lower" in said[0.0]
+    assert "which elites" not in said[-1e6]
 
 
 def test_the_share_of_exploring_centres_is_told_where_each_explores_or_exploits(folder):

@@ -103,6 +103,9 @@ def _progress(status: RunStatus) -> dict[str, str]:
         filled["map"] = (
             f"{counted(last['map_cells'], 'cell')}, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
         )
+        offset = status.run.constants["map.qd_offset"]
+        if last["qd_score"] < 0.0 or last["centre_fitness_mean"] < offset:
+            filled["map"] += f", which elites below map.qd_offset = {offset:g} lower"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     recent = read_recent(status.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
