@@ -178,7 +178,7 @@ def test_every_attribute_that_a_task_may_have_is_explained():
     _, docstring, code = (folder / "user_task.py").read_text().split('"""', 2)
     code += (folder / "declared.py").read_text()
     known = {*re.findall(r'(?:getattr|hasattr)\(task, "(\w+)"', code), "options"}  # `declared_options` reads the latter
-    table = TEXT["workers/README.md"].partition("A class may also have:")[2].partition("\n\n`")[0]
+    table = TEXT["workers/README.md"].partition("A class may also have:")[2].strip().partition("\n\n")[0]
     rows = {name for row in table.splitlines() for name in re.findall(r"`(\w+)[^`]*`", row.partition(" | ")[0])}
     assert known == rows
     assert known <= {*re.findall(r"`(\w+)[^`]*`", docstring)}
