@@ -152,8 +152,8 @@ class MemoryStore:
     def part(self, name: str) -> dict[str, np.ndarray]:
         return self.parts[name]
 
-    def last_history(self) -> dict | None:
-        return self.rows[-1] if self.rows else None
+    def newest_history(self, count: int) -> list[dict]:
+        return self.rows[-count:]
 
     def commit(self, generation, parts, history, evaluations) -> None:
         self.generation = generation

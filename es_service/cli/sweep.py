@@ -118,6 +118,9 @@ def run_sweep(
         raise
     constants = {key for run in planned for key in run.config.constants()}
     _compare(runs, out, [key for key, values in grid.items() if len(values) > 1 and key in constants])
+    for run in runs:
+        if run.state == "stopped":
+            print_note(f"{run.name} is not finished: {run.reason}. Raise budget.wall_clock_s")
     failed = [run for run in runs if run.state == "failed"]
     for run in failed:
         print_error(f"{run.name} failed: {run.reason}")

@@ -160,7 +160,12 @@ class BudgetConfig(Section):
 
     generations: Count | None = Field(None, description="Number of generations, summed over all sessions.")
     env_steps: Count | None = Field(None, description="Number of environment steps, evaluations included.")
-    wall_clock_s: Positive | None = Field(None, description="Running time in seconds, summed over all sessions.")
+    wall_clock_s: Positive | None = Field(
+        None,
+        description="Running time in seconds, summed over all sessions, from the start of workers on: with their "
+        "starting and compiling, but without a wait for a first place in a cluster, certifications, and the time "
+        "between a stop and a resume.",
+    )
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
     target_certified: Number | None = Field(
         None,

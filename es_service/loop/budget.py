@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from es_service.config.model import BudgetConfig
@@ -15,10 +15,13 @@ REACHED = {
     "target_fitness": "best_fitness",
 }
 """The column of the history that each key of the budget limits."""
+MOST_DURATIONS = 5
+"""Newest generations by whose durations a run judges whether another one can end within `wall_clock_s`."""
+PHASES = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
+"""Columns of the history whose sum is the duration of a generation."""
 _REASONS = {
     "generations": "the budget of {:,} generations is spent",
     "env_steps": "the budget of {:,} environment steps is spent",
-    "wall_clock_s": "the budget of {:g} s is spent",
     "target_fitness": "the target fitness {:g} is reached",
 }
 
@@ -28,24 +31,63 @@ def limits_of(budget: BudgetConfig) -> dict[str, float]:
     return {key: limit for key in REACHED if (limit := getattr(budget, key)) is not None}
 
 
-def spent(limits: Mapping[str, float], row: Mapping[str, float]) -> dict[str, str]:
+def durations(rows: Iterable[Mapping[str, float]]) -> tuple[float, ...]:
+    """Seconds of generations, by their rows of the history; without generation 0, which only evaluates, and generations
+    of which they are not known."""
+    seconds = (sum(row[phase] for phase in PHASES) for row in rows if row["generation"] > 0)
+    return tuple(duration for duration in seconds if math.isfinite(duration))
+
+
+def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequence[float] = ()) -> dict[str, str]:
     """Why a run is over, in words, by key of the budget; empty if it is not over.
 
-    Budgets are checked between generations, so a run may take more steps than its limit.
+    Budgets are checked between generations, so a run may take more steps and more time than its limit. It is over by
+    `wall_clock_s` also if the shortest of the recent generations would end after the limit: one alone says nothing,
+    since workers may have compiled in it.
 
     Args:
         row: the newest generation's row of the history; only the columns in REACHED are used.
+        recent: `durations` of the newest generations, at most MOST_DURATIONS.
     """
-    return {key: _REASONS[key].format(limit) for key, limit in limits.items() if row[REACHED[key]] >= limit}
+    reached = _reached(limits, row)
+    reasons = {key: _REASONS[key].format(limits[key]) for key in reached if key in _REASONS}
+    if (limit := limits.get("wall_clock_s")) is not None:
+        seconds, least = row["wall_clock_s"], min(recent) if len(recent) > 1 else 0.0
+        budget, over = f"the budget of {limit:g} s", f", exceeded by {seconds - limit:.1f} s"
+        if only_started(limits, row):
+            reasons["wall_clock_s"] = (
+                f"only starting took place: {budget} was spent before the first generation{over}, by starting workers, "
+                "compiling and evaluating the initial centres"
+            )
+        elif seconds >= limit:
+            reasons["wall_clock_s"] = f"{budget} is spent{over}"
+        elif seconds + least > limit:
+            reasons["wall_clock_s"] = (
+                f"{budget} has no time for another generation: {seconds:.1f} s are spent, and each of the last "
+                f"{len(recent)} generations took at least {least:.1f} s"
+            )
+    return reasons
 
 
-def raised(limits: Mapping[str, float], row: Mapping[str, Any]) -> dict[str, float | None]:
+def only_started(limits: Mapping[str, float], row: Mapping[str, float]) -> bool:
+    """Whether a run is over by `wall_clock_s` alone before its first generation, and so is not finished."""
+    return row["generation"] < 1 and _reached(limits, row) == ["wall_clock_s"]
+
+
+def _reached(limits: Mapping[str, float], row: Mapping[str, float]) -> list[str]:
+    """Keys of the limits that are reached."""
+    return [key for key, limit in limits.items() if row[REACHED[key]] >= limit]
+
+
+def raised(
+    limits: Mapping[str, float], row: Mapping[str, Any], recent: Sequence[float] = ()
+) -> dict[str, float | None]:
     """Limits to set, by key, so that a run that is over can continue; empty if it is not over.
 
     A limit that is spent is doubled, and a target fitness that is reached becomes None.
     """
     wanted: dict[str, float | None] = {}
-    for key in spent(limits, row):
+    for key in spent(limits, row, recent):
         limit, reached = limits[key], row[REACHED[key]]  # steps may exceed twice their limit
         wanted[key] = None if key == "target_fitness" else math.ceil(2 * (limit if 2 * limit > reached else reached))
     if "target_fitness" in wanted and limits.keys() == {"target_fitness"}:

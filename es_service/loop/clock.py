@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+from es_service.loop.budget import PHASES
+
 
 class Clock:
     """Measures how the time of each generation is spent. The time in which a generation is stored counts for the
@@ -33,5 +35,4 @@ class Clock:
         now = time.perf_counter()
         seconds, laps = now - self._generation_start, self._laps
         self._generation_start, self._laps = now, {}
-        names = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
-        return seconds, {name: laps.get(name, 0.0) for name in names}
+        return seconds, {name: laps.get(name, 0.0) for name in PHASES}

@@ -132,20 +132,30 @@ def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
     """The newest state in the store, without the elites' policies; None before the first generation."""
     if store.generation is None:
         return None
-    seconds = float((store.last_history() or {}).get("wall_clock_s") or 0.0)
-    parts = store.load(without=ELITE_PREFIX)
-    return state_from_parts(parts, store.generation, seconds, len(task.descriptor_names))
+    rows = store.newest_history(budgets.MOST_DURATIONS)
+    seconds = float(rows[-1]["wall_clock_s"] or 0.0) if rows else 0.0
+    state = state_from_parts(store.load(without=ELITE_PREFIX), store.generation, seconds, len(task.descriptor_names))
+    return replace(state, durations=budgets.durations(rows))
 
 
 def spent(budget: BudgetConfig, state: RunState) -> str | None:
     """Why the run is over, or None if it is not."""
-    reached = {
+    return next(iter(budgets.spent(budgets.limits_of(budget), _reached(state), state.durations).values()), None)
+
+
+def is_finished(budget: BudgetConfig, state: RunState) -> bool:
+    """Whether the run is over, and more than starting took place."""
+    return spent(budget, state) is not None and not budgets.only_started(budgets.limits_of(budget), _reached(state))
+
+
+def _reached(state: RunState) -> dict[str, float]:
+    """The columns of the history that a budget limits."""
+    return {
         "generation": state.generation,
         "env_steps": state.env_steps,
         "wall_clock_s": state.wall_clock_s,
         "best_fitness": state.best.fitness,
     }
-    return next(iter(budgets.spent(budgets.limits_of(budget), reached).values()), None)
 
 
 def _generation(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.loop.budget import MOST_DURATIONS, durations
 from es_service.loop.changes import Stored, changed_parts
 from es_service.loop.clock import Clock
 from es_service.loop.correction import Correction
@@ -91,8 +92,10 @@ def finish(
     )
     parts = changed_parts(state, before if before.generation >= 0 else None, stored)
     clock.lap("seconds_driver")
-    spent = clock.finish_generation()
-    return Finished(before, state, parts, cell_N, proposal, evaluations, updated, correction, faults, *spent)
+    seconds, laps = clock.finish_generation()
+    recent = (*before.durations, *durations([{"generation": generation, **laps}]))[-MOST_DURATIONS:]
+    state = replace(state, durations=recent)
+    return Finished(before, state, parts, cell_N, proposal, evaluations, updated, correction, faults, seconds, laps)
 
 
 def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:

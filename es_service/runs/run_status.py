@@ -12,13 +12,13 @@ from pydantic import ValidationError
 from es_service.config.caller import CALLER
 from es_service.config.model import BudgetConfig
 from es_service.errors import ConfigError, StoreError, WayOut
-from es_service.loop.budget import REACHED, limits_of, raised, spent
+from es_service.loop.budget import MOST_DURATIONS, REACHED, durations, limits_of, only_started, raised, spent
 from es_service.loop.history import Row
 from es_service.runs.certified import target_reached
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG, DATABASE, runs_inside
 from es_service.store.lock import last_end, lock_holder
-from es_service.store.reader import read_newest
+from es_service.store.reader import read_history, read_newest
 
 TARGET = "target_certified"
 """Key of the budget that certified policies reach."""
@@ -41,12 +41,19 @@ class RunStatus:
     """Why the run is over by `budget.target_certified`; empty if it is not."""
     end: str = ""
     """How the last session ended, in words, if there is no driver; empty if it is not known."""
+    durations: tuple[float, ...] = ()
+    """`budget.durations` of the newest generations, if a limit of the time needs them."""
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why the run is finished, by key of the budget; empty if it is not."""
+        """Why the run is over, by key of the budget; empty if it is not."""
         reached = {TARGET: self.certified} if self.certified else {}
-        return reached | (spent(self.limits, self.row) if self.row else {})
+        return reached | (spent(self.limits, self.row, self.durations) if self.row else {})
+
+    @property
+    def only_started(self) -> bool:
+        """Whether the run is over, but not finished, since starting took all of its time."""
+        return self.row is not None and not self.certified and only_started(self.limits, self.row)
 
 
 def population_size(constants: Mapping[str, Any]) -> str:
@@ -82,8 +89,19 @@ def status_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Ru
         certified = target_reached(run.folder, budget.target_certified, run.meta.config["task"]["fitness"])
     except StoreError:
         certified = ""  # damage of a certification, which `verify` names
-    end = "" if driver else last_end(run.folder)
-    return RunStatus(run, driver, row, limits_of(budget), certified=certified, end=end)
+    end, limits = "" if driver else last_end(run.folder), limits_of(budget)
+    recent = recent_durations(run.folder, limits, row)
+    return RunStatus(run, driver, row, limits, certified=certified, end=end, durations=recent)
+
+
+def recent_durations(folder: Path, limits: Mapping[str, float], row: Row | None) -> tuple[float, ...]:
+    """`budget.durations` of the newest generations of a run; none if no limit needs them, or if they cannot be read."""
+    if row is None or "wall_clock_s" not in limits:
+        return ()
+    try:
+        return durations(read_history(folder, max(0, int(row["generation"]) + 1 - MOST_DURATIONS), MOST_DURATIONS))
+    except StoreError:
+        return ()
 
 
 def is_waiting(status: RunStatus) -> bool:
@@ -107,7 +125,8 @@ def state(status: RunStatus) -> str:
     if status.problem:
         return f"stopped, and its budget cannot be read: {status.problem}"
     if status.reasons:
-        return f"finished: {next(iter(status.reasons.values()))}"
+        how = "stopped before its first generation" if status.only_started else "finished"
+        return f"{how}: {next(iter(status.reasons.values()))}"
     return "stopped before its budget was spent" + (f": {status.end}" if status.end else "")
 
 
@@ -125,7 +144,9 @@ def more(status: RunStatus) -> dict[str, float | None]:
     reached: dict[str, float | None] = {TARGET: None} if status.certified else {}
     if reached and not status.limits:
         reached["generations"] = 2 * max(1, status.row["generation"])  # otherwise nothing would end the run
-    return {f"budget.{key}": value for key, value in (reached | raised(status.limits, status.row)).items()}
+    return {
+        f"budget.{key}": value for key, value in (reached | raised(status.limits, status.row, status.durations)).items()
+    }
 
 
 def to_go(status: RunStatus) -> str:

@@ -68,6 +68,9 @@ class Outcome:
     run: Run
     reason: str
     """Which part of the budget is spent, in words; or the reason of the `Stop` that `on_generation` returned."""
+    is_finished: bool
+    """Whether the budget is spent or a target reached; False after a `Stop`, and if starting took all of
+    `budget.wall_clock_s`, so that the run has no generation."""
 
 
 def work(
@@ -126,7 +129,7 @@ def work(
         )
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
-        return Outcome(open_run(store.folder), reason)  # no engine needs to start
+        return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))  # without an engine
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
@@ -188,7 +191,7 @@ def work(
             state, reason = driver.run(search, engine, kept, state, after_generation, tell_failed)
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)
-    return Outcome(open_run(store.folder), reason)
+    return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))
 
 
 class CallerLeft(BaseException):

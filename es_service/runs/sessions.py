@@ -146,9 +146,9 @@ def _session(
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
         if reason := target_reached(folder, config.budget.target_certified, config.task.fitness):
-            return config, Outcome(open_run(folder), reason)
+            return config, Outcome(open_run(folder), reason, is_finished=True)
         if (is_due := targets.due(folder, config))(store.last_history()):
-            return config, Outcome(open_run(folder), targets.TO_CERTIFY)
+            return config, Outcome(open_run(folder), targets.TO_CERTIFY, is_finished=False)
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, is_due)
             told = listener.on_notice, listener.on_compile

@@ -22,12 +22,13 @@ from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
-from es_service.loop.budget import limits_of, spent
+from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
 from es_service.protocol.parent import bound, require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.system import given_path
 from es_service.runs.certified import target_reached
+from es_service.runs.run_status import recent_durations
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.sweep_cores import shared
@@ -61,7 +62,7 @@ class SweptRun:
     row: Row | None
     """History row of the newest generation; None before the first."""
     reason: str = ""
-    """Why it has finished or failed."""
+    """Why it has finished or failed, or stopped because starting took all of its time."""
 
 
 OnProgress = Callable[[Sequence[SweptRun]], None]
@@ -93,7 +94,8 @@ def sweep(
             `compute.workers` is a number; None: as many as there are cores, or one if they use GPUs.
 
     Returns:
-        The runs, each "finished" or "failed", for example for `write_comparison`.
+        The runs, for example for `write_comparison`: each "finished", "failed", or "stopped" since starting took all of
+            its `budget.wall_clock_s`.
 
     Raises:
         ConfigError: a config, the grid or the seeds are wrong, or a folder holds a run with other settings. StoreError:
@@ -219,7 +221,8 @@ def _ended(run: SweptRun, child: _Child, config: RunConfig) -> SweptRun:
         log.seek(max(child.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
         lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
     if code == 0:
-        return replace(run, state="finished", row=row, reason=_reason(run.folder, config, row))
+        state, reason = _end(run.folder, config, row)
+        return replace(run, state="finished" if state == "waiting" else state, row=row, reason=reason)
     how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     last = f"{how}; its last line is: {lines[-1]}" if lines else how
@@ -230,20 +233,21 @@ def _ended(run: SweptRun, child: _Child, config: RunConfig) -> SweptRun:
 def _at_first(planned: PlannedRun) -> SweptRun:
     """A run that the sweep has not started: finished, if its budget was spent or its target reached before."""
     row = _newest(planned.folder)
-    reason = _reason(planned.folder, planned.config, row)
-    return SweptRun(
-        planned.name, planned.folder, limits_of(planned.config.budget), "finished" if reason else "waiting", row, reason
-    )
+    state, reason = _end(planned.folder, planned.config, row)
+    return SweptRun(planned.name, planned.folder, limits_of(planned.config.budget), state, row, reason)
 
 
-def _reason(folder: Path, config: RunConfig, row: Row | None) -> str:
-    """Why a run is over; empty if it is not, or if it cannot be read, which its own process tells."""
+def _end(folder: Path, config: RunConfig, row: Row | None) -> tuple[Literal["waiting", "finished", "stopped"], str]:
+    """Whether a run that no process computes is over, and why; it is "waiting" if it is not, or if it cannot be read,
+    which its own process tells, and "stopped" if starting took all of its time."""
     if row is None:
-        return ""
+        return "waiting", ""
     with suppress(StoreError):
         if reached := target_reached(folder, config.budget.target_certified, config.task.fitness):
-            return reached
-    return next(iter(spent(limits_of(config.budget), row).values()), "")
+            return "finished", reached
+    limits = limits_of(config.budget)
+    reason = next(iter(spent(limits, row, recent_durations(folder, limits, row)).values()), "")
+    return ("stopped" if only_started(limits, row) else "finished" if reason else "waiting"), reason
 
 
 def _newest(folder: Path) -> Row | None:

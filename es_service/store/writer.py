@@ -188,11 +188,16 @@ class RunStore:
 
     def last_history(self) -> dict[str, int | float] | None:
         """History row of the newest generation; NaN stands for no value. None before the first commit."""
+        return next(iter(self.newest_history(1)), None)
+
+    def newest_history(self, count: int) -> list[dict[str, int | float]]:
+        """History rows of so many newest generations, in order; fewer if there are no more."""
         if self.generation is None:
-            return None
+            return []
+        columns, first = self.meta.columns, max(0, self.generation + 1 - count)
         with self._explaining("reading the history"):
-            ((newest, _),) = history_rows(self._connection, self.meta.columns, self.generation, check=False)
-        return row_dict(self.meta.columns, newest.row)
+            rows = list(history_rows(self._connection, columns, first, check=False))
+        return [row_dict(columns, stored.row) for stored, _ in rows]
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
         """Record the platform of a generation that is not stored yet, and of those after it, in place of their records.

@@ -131,7 +131,7 @@ def test_a_damaged_row_hides_only_what_is_read_from_it(console, tmp_path, capsys
         ({"generations": 3}, "generations is spent", {"budget.generations=6"}),
         ({"env_steps": 6000, "generations": 90}, "steps is spent", {"budget.env_steps=12000"}),
         ({"env_steps": 10}, "steps is spent", {"budget.env_steps=1200"}),
-        pytest.param({"wall_clock_s": 1e-6}, "s is spent", None, marks=pytest.mark.slow),
+        pytest.param({"wall_clock_s": 1e-6}, "s was spent", None, marks=pytest.mark.slow),
         ({"target_fitness": -1e9, "generations": 4}, "is reached", {"budget.target_fitness=null"}),
         ({"target_fitness": -1e9}, "is reached", {"budget.target_fitness=null", "budget.generations=2"}),
     ],
@@ -143,7 +143,9 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     print_status(console, run)
     printed = capsys.readouterr().out
     suggested = settings(more(read_status(run)))
-    assert f"state              finished: the {'target' if 'reached' in spent else 'budget'}" in printed
+    how = "stopped before its first generation: only starting" if "was spent" in spent else "finished: the"
+    assert f"state              {how} " in printed
+    assert ("\nNot done: ." if "was spent" in spent else "\nDone: .") in printed
     assert spent in printed
     assert printed.count(f"resume {run.folder} {' '.join(suggested)}") == 2
     assert suggested[::2] == ["--set"] * len(suggested[1::2])

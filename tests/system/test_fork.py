@@ -145,7 +145,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", Told(told))
     monkeypatch.setattr(
-        sessions, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "")
+        sessions, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "", True)
     )  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (

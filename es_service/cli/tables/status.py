@@ -77,7 +77,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     status, folder = read_status(run), run.folder
     sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
-    print_line(console, f"\nDone: {reason}.")
+    print_line(console, f"\n{'Not done' if status.only_started else 'Done'}: {reason}.")
     _print_fields(console, _progress(status) | _parameters(status) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (

@@ -85,7 +85,7 @@ def _print_changes(console: Console, before: dict[str, str], runs: Sequence[Swep
             why = f": {run.reason}" if run.reason else ""
             lines.append(f"{run.name}  {run.state}{at}{why}")
         before[run.name] = run.state
-    if all(run.state in ("finished", "failed") for run in runs):
+    if all(run.state not in ("waiting", "running") for run in runs):
         lines.append(count_line(runs))
     for line in lines:
         with suppress(SystemExit):  # rich's answer to a closed output

@@ -1,0 +1,118 @@
+"""When a budget ends a run, above all one of time, and what is said of it."""
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from es_service import api
+from es_service import sweep as api_sweep
+from es_service.cli.main import app
+from es_service.loop import budget, clock, driver
+from es_service.loop.budget import durations, only_started, spent
+from es_service.runs.run_status import more, read_status, state
+
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 5},
+    "policy": {"hidden": [4]},
+    "search": {"algorithm": "es", "pairs": 2, "evaluation_episodes": 1},
+    "budget": {"generations": 50},
+    "compute": {"engine": "inline", "workers": 1},
+}
+pytestmark = pytest.mark.usefixtures("workers_here")
+
+
+def row(generation=7, seconds=90.0):
+    return {"generation": generation, "env_steps": 10, "wall_clock_s": seconds, "best_fitness": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "recent", "reason"),
+    [
+        (90.0, (9.0, 30.0, 9.5), None),  # may end at 99
+        (90.0, (11.0, 30.0), "has no time for another generation: 90.0 s are spent, and each of the last 2 generations "
+                             "took at least 11.0 s"),
+        (90.0, (11.0,), None),  # in which workers may have compiled
+        (90.0, (), None),
+        (104.25, (1.0, 1.0), "is spent, exceeded by 4.2 s"),
+    ],
+)  # fmt: skip
+def test_a_budget_of_time_leaves_out_a_generation_that_cannot_end_in_it(seconds, recent, reason):
+    expected = {} if reason is None else {"wall_clock_s": f"the budget of 100 s {reason}"}
+    assert spent({"generations": 50, "wall_clock_s": 100.0}, row(seconds=seconds), recent) == expected
+
+
+def test_a_run_with_time_for_nothing_but_its_start_has_only_started():
+    late, limits = row(generation=0, seconds=40.7), {"wall_clock_s": 5.0}
+    assert spent(limits, late) == {
+        "wall_clock_s": "only starting took place: the budget of 5 s was spent before the first generation, exceeded "
+        "by 35.7 s, by starting workers, compiling and evaluating the initial centres"
+    }
+    assert only_started(limits, late)
+    assert not only_started(limits, row(generation=1, seconds=40.7))
+    assert not only_started({"generations": 0, **limits}, late)
+    assert not only_started({"wall_clock_s": 50.0}, late)
+
+
+def test_durations_are_those_of_generations_that_train_as_far_as_they_are_known():
+    rows = [{"generation": g, **dict.fromkeys(budget.PHASES, 0.5 * g)} for g in range(3)]
+    rows += [{"generation": 3, **dict.fromkeys(budget.PHASES, float("nan"))}]
+    assert durations(rows) == (2.5, 5.0)
+
+
+@pytest.fixture
+def slow(monkeypatch):
+    """A clock by which each generation takes 10 s."""
+    now = [0.0]
+
+    class Slow(clock.Clock):
+        def lap(self, name):
+            now[0] += 5.0 if name == "seconds_evaluation" else 0.0  # twice in a generation
+            super().lap(name)
+
+    monkeypatch.setattr(clock.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(driver, "Clock", Slow)
+
+
+@pytest.mark.usefixtures("slow")
+def test_a_run_stops_before_its_time_is_over_and_stays_over(tmp_path):
+    outcome = api.run(CONFIG | {"budget": {"wall_clock_s": 95.0}}, tmp_path / "run")
+    history = outcome.run.history
+    took = history.wall_clock_s.diff().iloc[-1]
+    assert history.wall_clock_s.iloc[-1] <= 95.0 < history.wall_clock_s.iloc[-1] + took
+    assert "has no time for another generation" in outcome.reason
+    assert outcome.is_finished
+    assert state(read_status(outcome.run)) == f"finished: {outcome.reason}"
+    again = api.resume(outcome.run.folder)
+    assert (again.reason, again.is_finished, again.run.generation) == (outcome.reason, True, outcome.run.generation)
+    assert more(read_status(outcome.run)) == {"budget.wall_clock_s": 190}
+    longer = api.resume(outcome.run.folder, {"budget.wall_clock_s": None, "budget.generations": 30}).run
+    whole = api.run(CONFIG | {"budget": {"generations": 30}}, tmp_path / "whole").run
+    assert longer.digest() == whole.digest()
+
+
+def test_a_run_that_only_started_is_not_finished(tmp_path):
+    outcome = api.run(CONFIG | {"budget": {"wall_clock_s": 1e-6}}, tmp_path / "run")
+    assert not outcome.is_finished
+    assert outcome.reason.startswith("only starting took place")
+    assert state(read_status(outcome.run)) == f"stopped before its first generation: {outcome.reason}"
+    assert not api.resume(outcome.run.folder).is_finished
+    assert api.resume(outcome.run.folder, {"budget.wall_clock_s": None, "budget.generations": 1}).is_finished
+
+
+def test_a_run_that_its_caller_stops_is_not_finished(tmp_path):
+    outcome = api.run(CONFIG, tmp_path / "run", on_generation=lambda row: api.Stop("enough"))
+    assert (outcome.reason, outcome.is_finished) == ("enough", False)
+
+
+@pytest.mark.slow
+def test_a_sweep_names_runs_that_only_started_and_leaves_them_alone(tmp_path):
+    file, out = tmp_path / "config.yaml", tmp_path / "sweep"
+    file.write_text(yaml.safe_dump(CONFIG | {"budget": {"wall_clock_s": 1e-6}}))
+    [swept] = api_sweep(str(file), out, seeds=range(1))
+    assert (swept.state, swept.row["generation"]) == ("stopped", 0)
+    assert swept.reason.startswith("only starting took place")
+    before = (swept.folder / "run.lock").read_bytes()
+    shown = CliRunner().invoke(app, ["sweep", str(file), "--seeds", "0:1", "--out", str(out)])
+    assert shown.exit_code == 0
+    assert f"note: {swept.name} is not finished: {swept.reason}. Raise budget.wall_clock_s" in shown.output
+    assert (swept.folder / "run.lock").read_bytes() == before
