@@ -114,5 +114,5 @@ def test_a_sweep_names_runs_that_only_started_and_leaves_them_alone(tmp_path):
     before = (swept.folder / "run.lock").read_bytes()
     shown = CliRunner().invoke(app, ["sweep", str(file), "--seeds", "0:1", "--out", str(out)])
     assert shown.exit_code == 0
-    assert f"note: {swept.name} is not finished: {swept.reason}. Raise budget.wall_clock_s" in shown.output
+    assert f"{swept.name} is not finished: {swept.reason}. Raise budget.wall_clock_s" in shown.output
     assert (swept.folder / "run.lock").read_bytes() == before
