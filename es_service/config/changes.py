@@ -45,6 +45,7 @@ STATE_KEYS = (
     "map.kind",
     "map.bounds",
     "map.cells",
+    "map.centroids",
 )
 """Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
 _CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}
@@ -52,14 +53,14 @@ _CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
 """Keys that are used only when a run starts."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
-_MAP = ("map.kind", "map.bounds", "map.cells")
+_MAP = ("map.kind", "map.bounds", "map.cells", "map.centroids")
 DERIVED_KEYS = {
     "task.environment": ("task.episode_steps", *_MAP, "map.qd_offset"),
     "task.episode_steps": ("map.qd_offset",),
     "task.fitness": ("map.qd_offset",),
     f"{TASK_OPTIONS}descriptor": _MAP,
     "task.descriptor": _MAP,
-    "map.kind": ("map.cells",),
+    "map.kind": ("map.cells", "map.centroids"),
     "policy.observation_normalization": ("policy.observation_clip",),
     "policy.output": ("policy.action_noise",),
     "search.algorithm": ("search.centres",),

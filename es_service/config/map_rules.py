@@ -16,7 +16,11 @@ MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000
 CVT_CELLS = 1024
 MOST_CVT_CELLS = 4096
-"""The time to place the centroids grows with the square of their number: about 15 seconds for this many."""
+PLACES_PER_CENTROID = {"lloyd": 50, "kmeans": 10}
+"""Random places by which centroids are placed, by `map.centroids`."""
+LLOYD_STEPS = 20
+MOST_PLACING_S = 600.0
+"""Longest estimated time of that, in seconds."""
 MOST_GRID_DIMENSIONS = 6
 """Largest number of descriptor dimensions for which `kind: auto` is a grid, else cvt."""
 LARGEST = 1e30
@@ -50,12 +54,24 @@ def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
     return task.least_reward * counted
 
 
+def placing_seconds(cells: int, dimensions: int, centroids: str) -> float:
+    """About how long it takes to place the centroids of a cvt, in seconds, as measured on one core of a Zen 4.
+
+    Args:
+        centroids: `map.centroids`; k-means is counted with as many steps as Lloyd's algorithm, which it rarely needs.
+    """
+    pairs = LLOYD_STEPS * PLACES_PER_CENTROID.get(centroids, 0) * cells**2
+    return pairs * (
+        1.4e-9 * min(dimensions, 7) + 1e-10 * dimensions
+    )  # from five dimensions on as a product of matrices
+
+
 def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Problems of a map that does not fit the descriptor or is too large."""
     problems = []
     names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
-    qd_offset = values.get("map.qd_offset", 0.0)
+    qd_offset, how = values.get("map.qd_offset", 0.0), values.get("map.centroids", "lloyd")
     if bounds is None and "map.bounds" in values:
         what = f"missing, since the descriptor of {task.name} has no bounds; give [low, high] for each of"
         problems.append(problem_of("map.bounds", None, f"{what} {', '.join(names)}, or set map.enabled = false"))
@@ -93,4 +109,12 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
             hint = " for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt"
             problem = f"{show(cells)} makes {math.prod(cells):,} cells; must be {allowed}{hint}"
             problems.append(problem_of("map.cells", cells, problem, allowed=allowed))
+        elif kind == "cvt" and (seconds := placing_seconds(cells[0], len(names), how)) > MOST_PLACING_S:
+            allowed = f"at most {int(cells[0] * math.sqrt(MOST_PLACING_S / seconds)):,}"
+            what = f"placing {cells[0]:,} centroids in {len(names):,} dimensions would take about {seconds:.0f} s"
+            hint = "" if how == "kmeans" else ", or map.centroids = kmeans, which is faster"
+            problems.append(problem_of("map.cells", cells, f"{what}; must be {allowed}{hint}", allowed=allowed))
+    if kind == "grid" and how != "lloyd":
+        what = f"{show(how)} has no effect with map.kind = grid; leave it out (a key of kind cvt)"
+        problems.append(problem_of("map.centroids", how, what, suggestion="lloyd"))
     return problems

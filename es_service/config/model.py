@@ -141,6 +141,11 @@ class MapConfig(Section):
         description="grid: number of cells along each dimension. cvt: one number, the number of all cells. auto: [100] "
         "for one dimension, [20, 20] for two, at most 10,000 cells in all for more; [1024] for a cvt."
     )
+    centroids: Literal["lloyd", "kmeans"] = Field(
+        "lloyd",
+        description="Of kind cvt: how the centroids are placed. lloyd: by 20 steps of Lloyd's algorithm on 50 random "
+        "places for each. kmeans: by SciPy's k-means on 10 places for each, which is faster and less even.",
+    )
     qd_offset: Number = Field(
         description="Fitness that counts as 0 in the QD-score. auto: the lowest reward of the task, times the steps of "
         "an episode with fitness sum; 0 if the task specifies no lowest reward: elites of negative fitness then lower "

@@ -61,6 +61,8 @@ LEAST_GRADIENT_BLOCK_NUMBERS = 4_000_000
 """Fewest noise numbers in a block, about 2 ms of work; a smaller block would cost more to send than to sum."""
 WITHOUT_PAIRS = 512
 """Pairs from which the shapes of a search without any are derived; they have no effect then."""
+MOST_DESCRIPTOR_DIMENSIONS = 974
+"""The history has two columns for each dimension and up to 51 others, and a table of SQLite 2,000 columns."""
 FEW_CHUNK_PAIRS = 8
 """A chunk with fewer pairs is likely to cost more to send and start than to compute."""
 
@@ -194,6 +196,13 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if (chosen := values.get("task.descriptor")) is not None and task.kind == "jax":
         why = f" for {task.name}, whose descriptor is its own"
         problems.append(not_allowed("task.descriptor", chosen, "null", why=why))
+    if (dimensions := len(with_options(task, options_of(values)).descriptor_names)) > MOST_DESCRIPTOR_DIMENSIONS:
+        key = "task.environment" if chosen is None else "task.descriptor"
+        what = (
+            f"the descriptor of {task.name} has {dimensions:,} dimensions; a run can store at most "
+            f"{MOST_DESCRIPTOR_DIMENSIONS}, since its history has two columns for each"
+        )
+        problems.append(problem_of(key, values.get(key), what, allowed=f"at most {MOST_DESCRIPTOR_DIMENSIONS}"))
     if (limit := values.get("task.time_limit_s")) is not None and task.kind == "jax":
         why = f" for {task.name}, whose steps take equal times"
         problems.append(not_allowed("task.time_limit_s", limit, "null", why=why))

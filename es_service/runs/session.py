@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from es_service.config.model import RunConfig, policy_spec, worker_spec
+from es_service.config.map_rules import placing_seconds
+from es_service.config.model import MapConfig, RunConfig, policy_spec, worker_spec
 from es_service.config.parallel import parallel_sentence
 from es_service.config.tasks import task_of
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_log
@@ -43,6 +44,8 @@ from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
 _LOG = logger(__name__)
+LONG_PLACING_S = 2.0
+"""Time from which on it is said that centroids are placed."""
 CALLS_S = 60.0
 """Seconds in which the process of a function can be replaced, beside the time of its calls."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
@@ -86,7 +89,8 @@ def work(
     """Run generations until the budget is spent or `on_generation` returns a `Stop`.
 
     Args:
-        on_compile: called with a sentence when workers compile, or make or reset environments, for some time.
+        on_compile: called with a sentence when workers compile, or make or reset environments, for some time, and
+            before centroids are placed for some time.
         strict: whether workers on another platform than the run's are an error.
         caller: what computes the episodes instead of the configured engine, if the task has none of its own.
     """
@@ -187,11 +191,24 @@ def work(
             tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
+        if state is None and (placing := _placing_sentence(config.map)):
+            _LOG.info(placing)
+            on_compile(placing)
         with patient_store(store, recorder, should_stop, tell, lambda stored: log(Committed(stored))) as kept:
             state, reason = driver.run(search, engine, kept, state, after_generation, tell_failed)
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)
     return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))
+
+
+def _placing_sentence(config: MapConfig) -> str:
+    """That centroids of the map are placed, if this takes long; else empty."""
+    if not config.enabled or config.kind == "grid":
+        return ""
+    cells, dimensions = config.cells[0], len(config.bounds)
+    seconds = placing_seconds(cells, dimensions, config.centroids)
+    about = f"{counted(cells, 'cell')} in {counted(dimensions, 'dimension')}, about {seconds:.0f} s"
+    return f"placing the centroids of the map ({about})" if seconds >= LONG_PLACING_S else ""
 
 
 class CallerLeft(BaseException):

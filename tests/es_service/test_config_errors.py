@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import sqlite3
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -10,9 +12,12 @@ from hypothesis import strategies as st
 
 from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
+from es_service.config.resolution import MOST_DESCRIPTOR_DIMENSIONS
 from es_service.errors import ConfigError
+from es_service.loop.history import history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms import OURS
+from es_service.store.schema import table_statements
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
 from tests.es_service.store_examples import without_root_rights
 from workers.rollouts import BACKENDS
@@ -298,6 +303,52 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     ]
     (line,) = problems(MINIMAL, "map.kind=cvt", "map.cells=[5000]")
     assert line == "map.cells: [5000] makes 5,000 cells; must be at most 4,096 for a cvt"
+    assert problems(MINIMAL, "map.centroids=kmeans") == [
+        "map.centroids: kmeans has no effect with map.kind = grid; leave it out (a key of kind cvt)"
+    ]
+
+
+def test_what_would_take_too_long_or_be_too_wide_is_refused_with_the_number():
+    def wide(dimensions):
+        names = tuple(f"x{index}" for index in range(dimensions))
+        return replace(POINT_MAZE, descriptor_names=names, descriptor_bounds=((-1.0, 1.0),) * dimensions)
+
+    def found(dimensions, *overrides):
+        try:
+            known = {"tasks": {"point_maze": wide(dimensions)}, "algorithms": OURS, "rollouts": BACKENDS}
+            load_config(MINIMAL, overrides, **known)
+        except ConfigError as error:
+            return [problem.sentence for problem in error.problems]
+        return []
+
+    assert found(1000, "map.enabled=false") == [
+        "task.environment: the descriptor of point_maze has 1,000 dimensions; a run can store at most 974, since its "
+        "history has two columns for each"
+    ]
+    assert (
+        found(974, "map.enabled=false")
+        == found(974, "map.kind=cvt")
+        == found(7, "map.cells=[4096]", "map.kind=cvt")
+        == []
+    )
+    assert found(974, "map.cells=[4096]") == [
+        "map.cells: placing 4,096 centroids in 974 dimensions would take about 1799 s; must be at most 2,365, or "
+        "map.centroids = kmeans, which is faster"
+    ]
+    assert found(974, "map.cells=[2365]") == found(974, "map.cells=[4096]", "map.centroids=kmeans") == []
+    assert found(100, "map.centroids=kmeans", "map.kind=grid", "map.cells=[2]")[-1].startswith(
+        "map.centroids: kmeans has"
+    )
+
+
+def test_the_history_of_the_widest_descriptor_fits_into_a_table():
+    names = tuple(f"x{index}" for index in range(MOST_DESCRIPTOR_DIMENSIONS))
+    columns = history_columns(replace(POINT_MAZE, descriptor_names=names), True, True, True)
+    connection = sqlite3.connect(":memory:")
+    connection.execute(table_statements(columns)["history"])
+    more = (*columns, *(replace(columns[-1], name=f"y{index}") for index in range(2)))
+    with pytest.raises(sqlite3.OperationalError, match="too many columns"):
+        sqlite3.connect(":memory:").execute(table_statements(more)["history"])
     with pytest.raises(ConfigError) as caught:
         load_config(
             MINIMAL,

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.cluster.vq import kmeans2
 
+from es_service import api
 from es_service.loop.parts import geometry_from_arrays, geometry_to_arrays
+from es_service.protocol.noise import Domain, stream_keys, uniforms
+from es_service.search.maps import geometry as geometries
 from es_service.search.maps.geometry import Cvt, Grid, intervals, make_geometry
+from tests.es_service.config_examples import MINIMAL
 from tests.es_service.map_examples import OBLONG, PLANE, SQUARE, map_config
 from tests.references import behaviour_map as reference
 
@@ -104,6 +109,47 @@ def test_centroids_lie_in_the_middle_of_their_cells():
     cell = cvt.cells_of(places)
     middle = np.array([places[cell == c].mean(axis=0) for c in range(16)])
     assert np.abs(middle - cvt.centroid_C_B).max() < 0.1  # a cell is half as wide as the square is high
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 7])
+def test_centroids_of_k_means_are_as_many_and_nearly_as_even(dimensions):
+    """A random place is at most 15 % farther from the nearest one than from one of Lloyd's, and nearer than to a random
+    one."""
+    bounds, config = ((-1.0, 3.0),) * dimensions, map_config(kind="cvt", cells=[200])
+    random_N_B = np.random.default_rng(0).uniform(-1.0, 3.0, (4000, dimensions))
+
+    def placed(how):
+        cvt = make_geometry(config.model_copy(update={"bounds": bounds, "centroids": how}))
+        assert isinstance(cvt, Cvt)
+        assert cvt.size == 200
+        assert ((cvt.centroid_C_B >= -1.0) & (cvt.centroid_C_B <= 3.0)).all()
+        return cvt
+
+    def distance(cvt):
+        return np.linalg.norm(random_N_B - cvt.middles_of(cvt.cells_of(random_N_B)), axis=1).mean()
+
+    lloyd, kmeans = distance(placed("lloyd")), distance(placed("kmeans"))
+    drawn = distance(Cvt(bounds, np.random.default_rng(1).uniform(-1.0, 3.0, (200, dimensions))))
+    assert kmeans < min(1.15 * lloyd, drawn)
+
+
+def test_the_default_centroids_are_those_of_twenty_steps_of_lloyd_s_algorithm_bit_for_bit():
+    bounds, key = [(0.0, 1.0), (-2.0, 2.0)], stream_keys(0, Domain.INITIALISATION, 0, 2**32)
+    place_N_B = uniforms(key, np.arange(50 * 9 * 2, dtype=np.uint32)).astype(np.float64).reshape(-1, 2)
+    share_C_B, _ = kmeans2(place_N_B, place_N_B[:9], iter=20, minit="matrix")
+    cvt = make_geometry(map_config(kind="cvt", cells=[9], bounds=[list(pair) for pair in bounds]))
+    assert isinstance(cvt, Cvt)
+    low_B, high_B = np.array(bounds).T
+    assert cvt.centroid_C_B.tobytes() == (low_B + share_C_B * (high_B - low_B)).tobytes()
+
+
+@pytest.mark.parametrize("search", ["jedi", "memes", "map_elites"])
+def test_a_config_is_read_without_placing_any_centroid(search, monkeypatch):
+    """A method counts something for each cell; the number of cells is known before."""
+    monkeypatch.setattr(geometries, "_centroids", lambda *_: pytest.fail("centroids are placed"))
+    starts = {"starts": "least_tried"} if search == "memes" else {}
+    config = MINIMAL | {"search": {"algorithm": search, **starts}, "map": {"kind": "cvt", "cells": [4096]}}
+    assert api.load_config(config).map.cells == (4096,)
 
 
 def test_the_nearest_centroid_and_of_equally_near_ones_the_first():

@@ -25,7 +25,7 @@ from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.dispatch.waits import AGAIN_S, NOTICE_S, SILENCE_S, Waits
 from es_service.protocol.messages import Chunk
-from es_service.runs import compiling, evaluation
+from es_service.runs import compiling, evaluation, session
 from es_service.runs.compiling import compiling_sentence, note_compiled, was_compiled
 from es_service.runs.run_status import doing, read_status
 from tests.helpers import spec
@@ -108,6 +108,18 @@ def test_a_cache_that_cannot_be_written_only_makes_it_the_first_time(tmp_path, m
 
 def test_every_kind_of_chunk_has_words():
     assert {kind.__name__ for kind in Chunk.__args__} == set(compiling.CONTENTS)
+
+
+@pytest.mark.usefixtures("workers_here")
+def test_a_run_says_how_long_it_places_centroids_and_a_resumed_one_has_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "LONG_PLACING_S", 0.0)
+    config, said = SMALL | {"map": {"kind": "cvt", "cells": [9]}, "budget": {"generations": 1}}, []
+    api.run(config, tmp_path / "run", on_compile=said.append)
+    sentence = "placing the centroids of the map (9 cells in 2 dimensions, about 0 s)"
+    assert [one for one in said if "centroids" in one] == [sentence]
+    api.resume(tmp_path / "run", ["budget.generations=2"], on_compile=said.append)
+    api.run(config | {"map": {"cells": [3, 3]}}, tmp_path / "grid", on_compile=said.append)
+    assert [one for one in said if "centroids" in one] == [sentence]
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ from es_service.search.algorithms.common import novelty_search, population
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.maps.geometry import make_geometry
+from es_service.search.maps.geometry import cell_count
 
 TARGET_CHOICE = 5
 """Last id of the random stream of Domain.SELECTION that draws the targets."""
@@ -92,7 +92,7 @@ def jedi(config: RunConfig) -> Algorithm:
     """Quality diversity by targets: ES towards cells of which a model of the map expects much or knows little."""
     require_model()
     search = settings_of(config, JediSettings)
-    shared, geometry = novelty_search(config, fitness_weight=1.0), make_geometry(config.map)
+    shared = novelty_search(config, fitness_weight=1.0)
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         target_M_B = state.extra[TARGET]
@@ -121,8 +121,9 @@ def jedi(config: RunConfig) -> Algorithm:
         if was_empty:
             extra[VISITS] = np.zeros_like(extra[VISITS])
         valid = [evaluation.descriptor_B for evaluation in evaluations if evaluation.valid]
-        if valid:
-            extra[VISITS] = extra[VISITS] + np.bincount(geometry.cells_of(np.array(valid)), minlength=geometry.size)
+        if valid and state.map is not None:
+            cell_N, cells = state.map.geometry.cells_of(np.array(valid)), state.map.geometry.size
+            extra[VISITS] = extra[VISITS] + np.bincount(cell_N, minlength=cells)
         if generation % search.target_generations == 0 and state.map is not None and state.map.size:
             candidate_C_B = promising(state.map, extra[VISITS], search.model_noise)
             key = stream_keys(config.seed, Domain.SELECTION, generation, TARGET_CHOICE)
@@ -131,7 +132,7 @@ def jedi(config: RunConfig) -> Algorithm:
         return replace(state, extra=read_only(extra))
 
     dimensions = len(config.map.bounds)
-    extra = {TARGET: np.full((search.emitters, dimensions), np.nan), VISITS: np.zeros(geometry.size, np.int64)}
+    extra = {TARGET: np.full((search.emitters, dimensions), np.nan), VISITS: np.zeros(cell_count(config.map), np.int64)}
     return replace(shared, start_cells=start_cells, ask=ask, tell=tell, extra=extra)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from es_service.config.model import NoveltyConfig, RunConfig
 from es_service.search.algorithms.base import SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
-from es_service.search.maps.geometry import make_geometry
+from es_service.search.maps.geometry import cell_count
 from es_service.search.novelty import NoveltyArchive, novelty
 from es_service.search.state_parts import read_only
 
@@ -27,7 +27,7 @@ TRIED = "tried"
 
 def counted_starts(config: RunConfig) -> dict[str, NDArray[np.int64]]:
     """The array TRIED before any start."""
-    return {TRIED: np.zeros(make_geometry(config.map).size, np.int64)}
+    return {TRIED: np.zeros(cell_count(config.map), np.int64)}
 
 
 def counting(restart: Restart) -> Restart:

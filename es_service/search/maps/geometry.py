@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from es_service.config.map_rules import LLOYD_STEPS, PLACES_PER_CENTROID
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 
@@ -25,8 +26,8 @@ LATTICE_PER_CELL = 8
 """Number of places along each side of a cell that are tested to find out whether the cell can be reached."""
 MOST_LATTICE_POINTS = 2_000_000
 OUTER_LATTICE = 100
-SAMPLES_PER_CENTROID = 50
-LLOYD_STEPS = 20
+KMEANS_CHANGE = 1e-4
+"""SciPy's k-means ends when a step changes the mean distance of a place by less."""
 CENTROID_STREAM = 2**32
 """Last id of the random stream of Domain.INITIALISATION that places centroids; no centre has this id."""
 
@@ -145,11 +146,16 @@ def intervals(geometry: Geometry) -> NDArray[np.float64]:
     return np.stack([edges[:-1], edges[1:]], axis=1)[np.argsort(order)]
 
 
+def cell_count(config: MapConfig) -> int:
+    """Number of cells that a config specifies."""
+    return math.prod(config.cells)
+
+
 def make_geometry(config: MapConfig) -> Geometry:
     """The cells that a config specifies; they are the same for every seed, so that runs can be compared by cell."""
     if config.kind == "grid":
         return Grid(config.bounds, config.cells)
-    return Cvt(config.bounds, _centroids(config.bounds, config.cells[0]))
+    return Cvt(config.bounds, _centroids(config.bounds, config.cells[0], config.centroids))
 
 
 def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | None:
@@ -191,14 +197,22 @@ def _lattice(bounds: Bounds, counts: tuple[int, int]) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def _centroids(bounds: Bounds, count: int) -> NDArray[np.float64]:
-    """Evenly spread centroids, [C, B]: Lloyd's algorithm on random places, started from the first `count` of them."""
-    from scipy.cluster.vq import kmeans2  # imported late: it takes 0.1 s, and most runs do not need it
+@cache
+def _centroids(bounds: Bounds, count: int, how: str) -> NDArray[np.float64]:
+    """Evenly spread centroids, [C, B]: `map.centroids` on random places, started from the first `count` of them."""
+    from scipy.cluster.vq import kmeans, kmeans2  # imported late: it takes 0.1 s, and most runs do not need it
 
     low_B, high_B = np.array(bounds, np.float64).T
-    samples = SAMPLES_PER_CENTROID * count
+    samples = PLACES_PER_CENTROID[how] * count
     key = stream_keys(0, Domain.INITIALISATION, 0, CENTROID_STREAM)
     share: Any = uniforms(key, np.arange(samples * len(bounds), dtype=np.uint32))
     place_N_B = share.astype(np.float64).reshape(samples, len(bounds))
-    centroid_C_B, _ = kmeans2(place_N_B, place_N_B[:count], iter=LLOYD_STEPS, minit="matrix")
-    return low_B + centroid_C_B * (high_B - low_B)
+    if how == "lloyd":
+        centroid_C_B, _ = kmeans2(place_N_B, place_N_B[:count], iter=LLOYD_STEPS, minit="matrix")
+    else:
+        centroid_C_B, _ = kmeans(place_N_B, place_N_B[:count], thresh=KMEANS_CHANGE)
+        lost = count - len(centroid_C_B)  # those to which no place was nearest
+        centroid_C_B = np.concatenate([centroid_C_B, place_N_B[count : count + lost]])
+    centroid_C_B = low_B + centroid_C_B * (high_B - low_B)
+    centroid_C_B.flags.writeable = False
+    return centroid_C_B
