@@ -99,7 +99,7 @@ class Certified:
     """Environment steps of all selection episodes of the certification, which belong to the cost of the result."""
     decides: bool | None
     """Whether the episodes decided if the run has reached `budget.target_certified`; None: of a version before 0.24,
-    whose certifications both decided and reported."""
+    whose certifications of a single candidate may have decided and were reported."""
     tries: int
     """Number of this decision, from 1, or of those until the run was over; 0 if no decision belongs to it."""
     platform: Mapping[str, Any]
@@ -158,9 +158,9 @@ def decisions(policies: Iterable[Certified]) -> list[Certified]:
 
 
 def passed(policies: Iterable[Certified], target: float, fitness: str) -> Certified | None:
-    """The first decision whose mean fitness reaches a target; None if none does."""
-    reaching = (one for one in decisions(policies) if one.episodes.mean_fitness(fitness) >= target)
-    return next(reaching, None)
+    """The newest decision whose mean fitness reaches a target; None if none does."""
+    reaching = [one for one in decisions(policies) if one.episodes.mean_fitness(fitness) >= target]
+    return reaching[-1] if reaching else None
 
 
 def report_of(policies: Iterable[Certified], decision: Certified) -> Certified | None:
@@ -228,7 +228,7 @@ def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def _from_row(row: CertifiedRow) -> Certified:
     arrays: dict[str, Any] = {"success_E": None, **row.arrays}
     policy = {name: arrays.pop(name) for name in _POLICY}
-    facts = {"decides": None, "tries": 0, **row.facts}
+    facts = {"decides": None if row.facts["candidates"] == 1 else False, "tries": 0, **row.facts}
     return Certified(row.number, row.rank, **facts, **policy, episodes=Episodes(**arrays))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -233,6 +234,24 @@ def test_certifications_of_a_run_of_0_23_are_read_and_it_remains_over(tmp_path):
     assert again.number == policy.number + 1
     assert run.digest() == digest
     assert get_schema(run.folder) == "7", "0.23 says that it cannot read the new rows"
+
+
+def test_what_0_23_selected_and_certified_decides_no_resume(tmp_path):
+    folder = api.run(api.load_config(CONFIG, ["budget.target_certified=-1000"]), tmp_path / "run").run.folder
+    as_0_23_wrote_it(folder, candidates=11)
+    [policy] = certified_policies(folder)
+    assert policy.decides is False
+    assert target_reached(folder, -1000, "sum") == ""
+    assert "(try 1)" in api.resume(folder).reason
+
+
+def test_of_several_decisions_that_reach_a_target_the_newest_counts(tmp_path):
+    folder = api.run(api.load_config(CONFIG, ["budget.target_certified=-1000"]), tmp_path / "run").run.folder
+    decision, report = all_certifications(folder)
+    later = [replace(decision, number=2, tries=2), replace(report, number=3)]
+    assert targets.passed([decision, report, *later], -1000, "sum") is later[0]
+    assert targets.report_of([decision, report, *later], later[0]) is later[1]
+    assert targets.report_of([decision, report, later[0]], later[0]) is None, "that of the one before is older"
 
 
 def get_schema(folder):
