@@ -48,7 +48,7 @@ def write_run(
     config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms=OURS, rollouts=BACKENDS)
     enabled, shape = config.map.enabled, policy_spec(config, task)
     meta = RunMeta(
-        run_id=f"run-{config.seed}",
+        run_id=f"{config.seed:032x}",
         created="2025-01-01T00:00:00+00:00",
         config=config.model_dump(mode="json"),
         constants=config.constants(),

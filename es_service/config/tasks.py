@@ -151,15 +151,15 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
         | {
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
-            "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
+            "walls": None if fields.get("walls") is None else tuple(bounds(wall) for wall in fields["walls"]),
             "notes": tuple(fields.get("notes", ())),
             "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
             "parameters": None
             if fields.get("parameters") is None
             else ParameterSpec.from_fields(*fields["parameters"]),
-            "options": {name: option(stored) for name, stored in fields["options"].items()},
+            "options": {name: option(stored) for name, stored in fields.get("options", {}).items()},
             "descriptors": {
-                name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()
+                name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields.get("descriptors", {}).items()
             },
         }
     )

@@ -227,7 +227,8 @@ def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]
 def _quartiles(values: Sequence[float]) -> Quartiles:
     if not values:
         return Quartiles(np.nan, np.nan, np.nan)
-    low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+    with np.errstate(invalid="ignore"):  # of values that are infinite
+        low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return Quartiles(float(median), float(low), float(high))
 
 

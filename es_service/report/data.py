@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
+from es_service.loop.forms import problem
 from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
+from es_service.runs.strangers import sizes_of, sound_meta
 from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.lock import lock_holder
@@ -125,7 +127,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     """The data of a run that was read before; `driver`: what `lock_holder` said before that."""
     problems = list(found.problems)
     run = Run(folder)
-    run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
+    run.__dict__["meta"] = sound_meta(folder, found.meta)  # it is cached there, and `run.db` itself may be damaged
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
     spec, point_D = task.parameters, None if best is None else best.get(POINT)
     return RunData(
@@ -146,7 +148,9 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     )
 
 
-def _kept(part: str, arrays: Arrays) -> Arrays | None:
+def _kept(meta: RunMeta, part: str, arrays: Arrays) -> Arrays | None:
+    if found := problem(part, arrays, sizes_of(meta)):
+        raise ValueError(found)
     if part.startswith(ELITE_PREFIX):
         return {TRACE: arrays[TRACE]}
     if part == BEST:
@@ -155,8 +159,8 @@ def _kept(part: str, arrays: Arrays) -> Arrays | None:
     return arrays if is_light(part) else None
 
 
-def _kept_without_paths(part: str, arrays: Arrays) -> Arrays | None:
-    return None if part.startswith(ELITE_PREFIX) else _kept(part, arrays)
+def _kept_without_paths(meta: RunMeta, part: str, arrays: Arrays) -> Arrays | None:
+    return None if part.startswith(ELITE_PREFIX) else _kept(meta, part, arrays)
 
 
 def followed(folder: Path) -> Followed:

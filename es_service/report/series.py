@@ -215,7 +215,7 @@ def phase_curves(history: Columns) -> tuple[NDArray[np.float64], Mapping[str, ND
     """Generation at the end of each group [K], and by label of PHASES the mean seconds of a generation [K]."""
     ends_K = groups(len(history["generation"]))
     curves = {
-        label: np.nan_to_num(thinned(history[column], ends_K, "mean"))
+        label: np.maximum(np.nan_to_num(thinned(history[column], ends_K, "mean")), 0.0)  # a forged time may be negative
         for column, label in PHASES.items()
         if column in history
     }

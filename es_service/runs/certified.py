@@ -11,15 +11,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import create_model
 
+from es_service.errors import StoreError
+from es_service.loop.forms import BOOL, INTEGER, REAL, Sizes, array_problem
 from es_service.protocol.messages import FloatArray
 from es_service.runs.intervals import false_pass_share, mean_interval, share_interval
+from es_service.runs.strangers import sizes_of
 from es_service.store.certifications import CertifiedRow
-from es_service.store.reader import read_certifications
+from es_service.store.facts import Damaged, Form, require_form
+from es_service.store.reader import read_certifications, read_meta
 
 EPISODES = 256
 """Certification episodes of a policy, unless a call says otherwise; and the episodes of a decision."""
@@ -137,7 +142,9 @@ class Certified:
 def all_certifications(folder: Path) -> list[Certified]:
     """All certified policies and all decisions of a run, in the order of certification and rank. Raises StoreError if
     one is damaged."""
-    return [_from_row(row) for row in read_certifications(folder)]
+    rows = read_certifications(folder)
+    sizes = sizes_of(read_meta(folder))
+    return [_from_row(folder, row, sizes) for row in rows]
 
 
 def certified_policies(folder: Path) -> list[Certified]:
@@ -149,7 +156,8 @@ def newest_certified(folder: Path) -> Certified | None:
     """The policy that the newest certification of a run has put first; None if there is none, or if damage has removed
     it. No older certification is read. Raises StoreError if it is damaged."""
     rows = read_certifications(folder, newest=lambda facts: not facts.get("decides"))
-    return next((_from_row(row) for row in rows if row.rank == 0), None)
+    first = next((row for row in rows if row.rank == 0), None)
+    return None if first is None else _from_row(folder, first, sizes_of(read_meta(folder)))
 
 
 def decisions(policies: Iterable[Certified]) -> list[Certified]:
@@ -225,11 +233,31 @@ def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     return facts, {name: getattr(policy, name) for name in _POLICY} | arrays_of(policy.episodes)
 
 
-def _from_row(row: CertifiedRow) -> Certified:
+_HINTS = get_type_hints(Certified)
+_Facts = create_model("_Facts", __base__=Form, **{name: (_HINTS[name], ...) for name in _FACTS})  # type: ignore[call-overload]
+_NEEDED = {
+    **dict.fromkeys((*_POLICY, "return_E", "last_reward_E", "goal_distance_E", "descriptor_E_B"), REAL),
+    "steps_E": INTEGER,
+}
+_MORE = {"success_E": BOOL}
+
+
+def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
+    """A certified policy of the store. Raises StoreError if it is none of a run of these sizes."""
+    lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions}
+    found = array_problem(row.arrays, _NEEDED, _MORE, lengths)
+    older = {"decides": None if row.facts.get("candidates") == 1 else False, "tries": 0}
+    facts = {**older, **row.facts}
+    try:
+        require_form(facts, _Facts, "its facts")
+    except Damaged as error:
+        found = str(error)
+    if found or not lengths["E"]:
+        which = f"row {row.rank} of certification {row.number}"
+        raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
     arrays: dict[str, Any] = {"success_E": None, **row.arrays}
-    policy = {name: arrays.pop(name) for name in _POLICY}
-    facts = {"decides": None if row.facts["candidates"] == 1 else False, "tries": 0, **row.facts}
-    return Certified(row.number, row.rank, **facts, **policy, episodes=Episodes(**arrays))
+    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts[name] for name in _FACTS}
+    return Certified(row.number, row.rank, **own, episodes=Episodes(**arrays))
 
 
 def _interval(name: str, values_E: NDArray[np.float64] | None) -> dict[str, float | None]:

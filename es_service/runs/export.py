@@ -19,6 +19,7 @@ from es_service.runs.trackers import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
+from es_service.store.folder import leads_out
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,20 +35,25 @@ SUMS = "SHA256SUMS"
 
 def export(run: Run, to: str, folder: Path) -> list[Path]:
     """Write a run into `folder`, which is created if needed, and return the files written. Older files are replaced.
-    Of other formats than that of TensorBoard, the last file, `SHA256SUMS`, has the SHA-256 of the others.
+    Of other formats than that of TensorBoard, the last file, `SHA256SUMS`, has the SHA-256 of the others. No link in
+    the folder of a run is followed: that of a stranger might lead to other files of the user's.
 
     Args:
         to: a key of FORMATS.
 
     Raises:
         ConfigError: the format is unknown, or needs a package that is not installed. NotInRunError: the run has no
-            finished generation, or not the map that the format needs. StoreError: the folder cannot be written.
+            finished generation, or not the map that the format needs. StoreError: the folder cannot be written, or is
+            inside the run's and leads out of it.
     """
     if to not in FORMATS:
         raise unknown_name("format", to, FORMATS, "to")
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
+    if folder.absolute().is_relative_to(run.folder.absolute()) and leads_out(folder, run.folder):
+        what = f"{folder} is a link that leads out of {run.folder}; name the folder to write into"
+        raise StoreError(what, field="out", value=str(folder), run=run.folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         files = FORMATS[to](run, folder)
@@ -210,10 +216,19 @@ def _parameters(snapshot: Snapshot, spec: ParameterSpec, *, has_map: bool) -> pd
     return table
 
 
+def _new(folder: Path, name: str) -> Path:
+    """A path to write to; what is there is removed unless it is a file, since writing to a link changes what it leads
+    to."""
+    path = folder / name
+    if path.is_symlink() or not path.is_file():
+        path.unlink(missing_ok=True)
+    return path
+
+
 def _csv(run: Run, folder: Path) -> list[Path]:
     written = []
     for name, table in tables(run):
-        written.append(folder / f"{name}.csv")
+        written.append(_new(folder, f"{name}.csv"))
         table.to_csv(written[-1], index=False, lineterminator="\n")
     return written
 
@@ -221,7 +236,7 @@ def _csv(run: Run, folder: Path) -> list[Path]:
 def _parquet(run: Run, folder: Path) -> list[Path]:
     written = []
     for name, table in tables(run):
-        written.append(folder / f"{name}.parquet")
+        written.append(_new(folder, f"{name}.parquet"))
         try:
             table.to_parquet(written[-1], index=False)
         except ImportError as error:
@@ -232,7 +247,7 @@ def _parquet(run: Run, folder: Path) -> list[Path]:
 
 def _write_sums(folder: Path, files: list[Path]) -> Path:
     """Write the SHA-256 of new files into SHA256SUMS, beside those of other files that are still there."""
-    sums, digests = folder / SUMS, {}
+    sums, digests = _new(folder, SUMS), {}
     if sums.exists():
         lines = (line.partition("  ") for line in sums.read_text(encoding="utf-8", errors="replace").splitlines())
         there = {path.name for path in folder.iterdir()}
@@ -249,13 +264,13 @@ def _install(extra: str) -> WayOut:
 
 
 def _npz(run: Run, folder: Path) -> list[Path]:
-    file = folder / "policies.npz"
+    file = _new(folder, "policies.npz")
     np.savez(file, allow_pickle=False, **arrays(run))
     return [file]
 
 
 def _ribs(run: Run, folder: Path) -> list[Path]:
-    file = folder / "archive.pickle"
+    file = _new(folder, "archive.pickle")
     archive = ribs_archive(run)
     with file.open("wb") as stream:
         pickle.dump(archive, stream)

@@ -343,8 +343,8 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
         search = replace(search, algorithm=_with_past(search.algorithm, past_N_B))
     history, evaluations = columns(config, task)
     meta = RunMeta(
-        run_id="measurement",
-        created="",
+        run_id=f"{0:032x}",
+        created="2025-01-01T00:00:00+00:00",
         config=config.model_dump(mode="json"),
         constants=config.constants(),
         task=asdict(task),

@@ -29,6 +29,7 @@ from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
+from es_service.runs.strangers import require_sound_state
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import patient_store
 from es_service.runs.worker_count import work_at_once, worker_count
@@ -131,6 +132,7 @@ def work(
             f"{task.does_not_repeat}. So neither does the run: with other workers or after a resume it has other "
             "numbers, and `verify` cannot judge it. The run records this"
         )
+    require_sound_state(store)
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
         return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))  # without an engine

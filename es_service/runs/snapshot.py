@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.keys import policy_of
 from es_service.errors import NotInRunError
 from es_service.loop.parts import (
     BEST,
@@ -28,6 +27,7 @@ from es_service.loop.parts import (
 )
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.messages import FloatArray, PolicySpec
+from es_service.runs.strangers import policy_spec
 from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
@@ -221,11 +221,6 @@ class Snapshot:
 def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
     """A policy with the network and the observation clip of a run."""
     return Policy(policy_spec(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
-
-
-def policy_spec(meta: RunMeta) -> PolicySpec:
-    """What a run's policies are."""
-    return policy_of(meta.constants, meta.task["observation_size"], meta.task["action_size"])
 
 
 def descriptor_names(meta: RunMeta) -> list[str]:

@@ -99,7 +99,9 @@ class TensorBoard:
 
     def files(self) -> list[Path]:
         """The event files of this run."""
-        return sorted(self._folder.glob(f"events.out.tfevents.*.{self._run.run_id}.*"))
+        mark = f".{self._run.run_id}."
+        there = self._folder.iterdir() if self._folder.is_dir() else ()
+        return sorted(file for file in there if file.name.startswith("events.out.tfevents.") and mark in file.name)
 
     def newest(self) -> int:
         event_type = importlib.import_module("tensorboardX.proto.event_pb2").Event

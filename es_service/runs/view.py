@@ -19,7 +19,8 @@ from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.system import given_path
 from es_service.runs.certified import all_certifications, certified_policies, newest_certified
-from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, policy_spec
+from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy
+from es_service.runs.strangers import policy_spec, sound_meta, sound_parts
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.digest import checked_parts, digest_of
@@ -44,7 +45,7 @@ class Run:
     @cached_property
     def meta(self) -> RunMeta:
         """The data that were fixed when the run was created."""
-        return reader.read_meta(self.folder)
+        return sound_meta(self.folder, reader.read_meta(self.folder))
 
     @property
     def run_id(self) -> str:
@@ -112,9 +113,11 @@ class Run:
     ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
         """A generation (None: the newest) and its verified state parts, those `wanted`.
 
-        Raises StoreError if the state is not kept: the last two are, and those of `store.keep_every`.
+        Raises StoreError if the state is not kept: the last two are, and those of `store.keep_every`; or if it is none
+        of this run.
         """
-        return reader.read_parts(self.folder, generation, wanted)
+        at, parts = reader.read_parts(self.folder, generation, wanted)
+        return at, sound_parts(self.folder, self.meta, parts, wanted)
 
     def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Snapshot:
         """The state after a generation, with the arguments of `parts`. All parts together take as much memory as all of
@@ -167,12 +170,13 @@ class Run:
 
         def chosen(at: int, parts: Parts) -> list[str]:
             nonlocal cells
-            snapshot = Snapshot(self.folder, self.meta, at, parts)
+            snapshot = Snapshot(self.folder, self.meta, at, sound_parts(self.folder, self.meta, parts, is_light))
             cells = snapshot.behaviour_map.cell_N.tolist() if choose is None else choose(snapshot)
             return [elite_part(cell) for cell in cells]
 
-        found = reader.read_parts(self.folder, generation, is_light, chosen)
-        return Snapshot(self.folder, self.meta, *found).elites(cells)
+        at, parts = reader.read_parts(self.folder, generation, is_light, chosen)
+        parts = sound_parts(self.folder, self.meta, parts, is_light)
+        return Snapshot(self.folder, self.meta, at, parts).elites(cells)
 
     @property
     def certified(self) -> pd.DataFrame:

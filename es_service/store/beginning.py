@@ -26,6 +26,7 @@ from es_service.store.codec import (
     state_sum,
     stored_values,
 )
+from es_service.store.facts import Damaged
 from es_service.store.platforms import record
 from es_service.store.rows import insert_history
 from es_service.store.schema import RunMeta, get_meta, put_meta
@@ -79,6 +80,9 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
 
 
 def load_start(connection: sqlite3.Connection) -> dict[str, NDArray[Any]] | None:
-    """`Beginning.start` from a verified database; None if there is none."""
+    """`Beginning.start` from a verified database; None if there is none. Raises Damaged if it has no arrays."""
     text = get_meta(connection, _START)
-    return None if text is None else decode_part(base64.b64decode(text))
+    try:
+        return None if text is None else decode_part(base64.b64decode(text))
+    except ValueError as error:
+        raise Damaged(f"the policy from which it started cannot be read: {error}") from error

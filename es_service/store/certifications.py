@@ -16,6 +16,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.store.codec import Part, decode_part, encode_part
+from es_service.store.facts import Count, Damaged, facts, require_form
 
 CERTIFICATIONS = "certifications"
 """Key of a run's `RunMeta.parent`: number of the next certification of the parent when this run began."""
@@ -40,8 +41,8 @@ class CertifiedRow:
 
 def insert(connection: sqlite3.Connection, number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> None:
     """Store a certification: (facts, arrays) of each policy in the order of rank."""
-    for rank, (facts, arrays) in enumerate(policies):
-        text, payload = json.dumps(facts, sort_keys=True), encode_part(arrays)
+    for rank, (known, arrays) in enumerate(policies):
+        text, payload = json.dumps(known, sort_keys=True), encode_part(arrays)
         row = (number, rank, text, payload, _sha256(number, rank, text, payload))
         connection.execute("INSERT INTO certification VALUES (?, ?, ?, ?, ?)", row)
 
@@ -69,13 +70,19 @@ def rows(
     """
     row_list: list[tuple[Key, CertifiedRow | None]] = []
     query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number"
-    for number, rank, facts, payload, sha256 in connection.execute(f"{query} {'DESC' if newest else ''}, rank"):
+    for number, rank, text, payload, sha256 in connection.execute(f"{query} {'DESC' if newest else ''}, rank"):
         if newest and row_list and row_list[0][0][0] != number:
             break
-        if not isinstance(payload, bytes) or _sha256(number, rank, facts, payload) != sha256:
+        if not isinstance(payload, bytes) or _sha256(number, rank, text, payload) != sha256:
             row_list.append(((number, rank), None))
-        elif facts != _REMOVED and (newest is None or newest(json.loads(facts))):
-            row_list.append(((number, rank), CertifiedRow(number, rank, json.loads(facts), decode_part(payload))))
+        elif text != _REMOVED:
+            try:
+                require_form((number, rank), tuple[Count, Count], "its number and rank")
+                row = CertifiedRow(number, rank, facts(text, dict[str, Any], "its facts"), decode_part(payload))
+            except (Damaged, ValueError):
+                row = None
+            if row is None or newest is None or newest(row.facts):
+                row_list.append(((number, rank), row))
     return row_list
 
 

@@ -12,13 +12,15 @@ import operator
 import struct
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, StringConstraints
 
 from es_service.errors import StoreError
 from es_service.loop.history import NO_INTEGER, Column
+from es_service.store.facts import Damaged, facts
 
 Part = Mapping[str, NDArray[Any]]
 """A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
@@ -40,6 +42,10 @@ _HEADER_LENGTH = struct.Struct("<I")
 INTEGER = struct.Struct("<cq")
 REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
+_TYPE = Annotated[str, StringConstraints(pattern=f"^[<|][{_NUMERIC_KINDS}][0-9]{{1,2}}$")]
+_SHAPE = Annotated[list[Annotated[int, Field(ge=0, lt=2**48)]], Field(max_length=32)]
+_HEADER = list[tuple[str, _TYPE, _SHAPE]]
+"""Name, type and shape of each array, as JSON."""
 
 
 def encode_part(part: Part) -> bytes:
@@ -73,20 +79,27 @@ def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
         raise ValueError(f"a state payload begins with {payload[:4]!r} instead of {_MAGIC!r}")
     position = 8 + _HEADER_LENGTH.unpack_from(payload, 4)[0]
     try:
-        entries = [(str(name), np.dtype(kind), tuple(shape)) for name, kind, shape in json.loads(payload[8:position])]
-    except (TypeError, ValueError) as error:
+        entries = _entries(payload[8:position])
+    except (Damaged, TypeError) as error:
         raise ValueError(f"a state payload has an unreadable header: {error}") from error
     part: dict[str, NDArray[Any]] = {}
     for name, dtype, shape in entries:
         count = math.prod(shape)
-        if dtype.kind not in _NUMERIC_KINDS or count < 0 or position + count * dtype.itemsize > len(payload):
-            raise ValueError(f"a state payload is too short for its array {name!r}")
+        if position + count * dtype.itemsize > len(payload) or name in part:
+            raise ValueError(f"a state payload is too short for its array {name!r}, or has it twice")
         flat = np.frombuffer(payload, dtype, count, position)
         part[name] = flat.reshape(shape).astype(dtype.newbyteorder("="), copy=True)
         position += flat.nbytes
     if position != len(payload):
         raise ValueError("a state payload is longer than its header says")
     return part
+
+
+@lru_cache(maxsize=1024)
+def _entries(header: bytes) -> tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]:
+    """The entries of a header; kept, as `_header`. Raises Damaged, or TypeError for a type that NumPy does not have."""
+    entries = facts(header, _HEADER, "it")
+    return tuple((name, np.dtype(kind), tuple(shape)) for name, kind, shape in entries)
 
 
 def part_sha256(part: str, generation: int, payload: bytes) -> str:

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from es_service.errors import StoreError, WayOut
+from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, is_no_damage, require_run_folder
 from es_service.store.lock import lock_holder
-from es_service.store.schema import Damaged, RunMeta, load_meta
+from es_service.store.schema import RunMeta, load_meta
 
 _BUSY_S = 5.0
 

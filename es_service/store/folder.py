@@ -101,6 +101,11 @@ def runs_inside(folder: Path) -> set[Path]:
     return {run for run in runs if not run.name.startswith(".")}
 
 
+def leads_out(path: Path, root: Path) -> bool:
+    """Whether a path below a folder leads out of it, by a link or by `..`."""
+    return not path.resolve().is_relative_to(root.resolve())
+
+
 def require_run_folder(folder: Path) -> None:
     """Raise StoreError unless a folder contains a run."""
     if folder.is_file():

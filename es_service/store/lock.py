@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from es_service.errors import RunLockedError, StoreError, WayOut
+from es_service.store.facts import Damaged, facts
 from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
@@ -162,10 +163,9 @@ def last_end(folder: Path) -> str:
 
 def _content(text: bytes) -> dict[str, Any]:
     try:
-        content = json.loads(text)
-    except ValueError:
+        return facts(text, dict[str, str | int | None], LOCK, has_paths=True)
+    except Damaged:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _locked(folder: Path) -> RunLockedError:

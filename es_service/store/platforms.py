@@ -7,7 +7,8 @@ import sqlite3
 from typing import Any
 
 from es_service.store.codec import text_sha256
-from es_service.store.schema import Damaged, get_meta, put_meta
+from es_service.store.facts import Damaged, Platform, facts
+from es_service.store.schema import get_meta, put_meta
 
 LIST = "platforms"
 """Key of the list of the rows' generations in the table `meta`, by which the loss of a row is noticed. Older versions
@@ -52,9 +53,10 @@ def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str,
     for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
         if text_sha256(f"platform {at}", text) != sha256:
             raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-        platforms[at] = json.loads(text)
+        platforms[at] = facts(text, Platform, f"the platform recorded at generation {at}")
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    for at in [] if newest is None else json.loads(get_meta(connection, LIST) or "[]"):
+    listed = facts(get_meta(connection, LIST) or "[]", list[int], "the list of its platforms")
+    for at in [] if newest is None else listed:
         # The row of a generation that was lost, and is not computed again yet, was deleted with it.
         if at <= newest and at not in platforms:
             raise Damaged(f"the platform recorded at generation {at} is missing")

@@ -14,20 +14,18 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
-from es_service.loop.history import Column
 from es_service.store import certifications
 from es_service.store.beginning import load_start
 from es_service.store.certifications import CertifiedRow
-from es_service.store.codec import row_dict
+from es_service.store.codec import Row, row_dict
 from es_service.store.connection import reading
+from es_service.store.facts import GENERATION, Damaged
 from es_service.store.platforms import sound_platforms
 from es_service.store.rows import HistoryRow, history_rows, newest_generation
-from es_service.store.schema import Damaged, RunMeta
+from es_service.store.schema import RunMeta
 from es_service.store.states import KeptRows, kept_rows, newest_state, rows_in_force, sound_part, whole_states
 from es_service.store.tables import Columns, GrowingTable, table_rows
 
-GENERATION = Column("generation", "INTEGER", True, "generation that evaluated the centre")
-"""The column before those of the evaluated centres."""
 EvaluatedCentres = list[dict[str, int | float]]
 """The centres that one generation evaluated, as values by column name; NaN stands for no value."""
 
@@ -79,9 +77,7 @@ def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None 
     """The centres that each generation evaluated, in the order of the asks; arguments as in `read_history`."""
     with reading(folder) as (connection, meta):
         columns = meta.evaluation_columns
-        tables = (
-            table_rows(columns, stored.evaluations) for stored in _sound_rows(connection, meta, since_generation, limit)
-        )
+        tables = (_evaluated(meta, stored) for stored in _sound_rows(connection, meta, since_generation, limit))
         return [[row_dict(columns, row) for row in rows] for rows in tables]
 
 
@@ -91,9 +87,17 @@ def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
     with reading(folder) as (connection, meta):
         table = GrowingTable((GENERATION, *meta.evaluation_columns))
         for stored in _sound_rows(connection, meta, 0, limit):
-            for row in table_rows(meta.evaluation_columns, stored.evaluations):
+            for row in _evaluated(meta, stored):
                 table.add((stored.generation, *row))
         return table.columns()
+
+
+def _evaluated(meta: RunMeta, stored: HistoryRow) -> list[Row]:
+    """The centres that a generation evaluated. Raises Damaged if they do not fit the columns."""
+    try:
+        return table_rows(meta.evaluation_columns, stored.evaluations)
+    except ValueError as error:
+        raise Damaged(f"the history row of generation {stored.generation} cannot be read: {error}") from error
 
 
 def read_row(folder: Path, generation: int) -> HistoryRow:
@@ -134,7 +138,7 @@ def read_parts(
     """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`, and
     of those that `further` names when it sees these, all as of one moment.
 
-    Raises StoreError also if the state of this generation is not kept, and KeyError if it has no such further part.
+    Raises StoreError also if the state of this generation is not kept, or has no such further part.
     """
     with reading(folder) as (connection, _):
         newest = newest_generation(connection)
@@ -160,6 +164,8 @@ def read_parts(
         rows = rows_in_force(kept, asked)
         parts = {part: sound_part(connection, part, *row) for part, row in rows.items() if wanted(part)}
         names = further(asked, parts)
+        if lacking := [part for part in names if part not in rows]:
+            raise Damaged(f"its state has no part {lacking[0]}")
         return asked, parts | {part: sound_part(connection, part, *rows[part]) for part in names if part not in parts}
 
 
@@ -195,6 +201,6 @@ def read_certifications(folder: Path, newest: Callable[[Mapping[str, Any]], bool
         rows = []
         for (number, rank), row in certifications.rows(connection, newest):
             if row is None:
-                raise Damaged(f"row {rank} of certification {number} does not match its SHA-256")
+                raise Damaged(f"row {rank} of certification {number} is damaged")
             rows.append(row)
         return rows

@@ -15,8 +15,9 @@ from pathlib import Path
 from es_service.errors import StoreError
 from es_service.store import certifications
 from es_service.store.connection import connected_to
+from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file
-from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, Damaged, load_meta, quoted
+from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, load_meta, quoted
 from es_service.store.verify import Verdict, verify
 
 PATIENCE_S = 10.0

@@ -1,4 +1,5 @@
-"""The history rows of a run as they are stored, and whether they are sound: whether they match their SHA-256.
+"""The history rows of a run as they are stored, and whether they are sound: whether they match their SHA-256, and have
+values of the types of their columns.
 
 All who read a history read it through this file. Readers refuse a row that is not sound (`reader`), reports leave it
 out (`sound`), the verification names it (`verify`), and the digest takes the values as they are (`digest`).
@@ -57,13 +58,14 @@ def history_rows(
         check: False: no SHA-256 is computed, and every row counts as sound.
     """
     heading, names = column_bytes(columns), [column.name for column in columns]
+    types = [(int, type(None)) if column.type == "INTEGER" else (float, type(None)) for column in columns]
     # Names are qualified by the table, because SQLite treats an unqualified quoted name that is no column as a text.
     wanted = ", ".join(f"history.{quoted(name)}" for name in [*names, *OWN_HISTORY_COLUMNS])
     query = f"SELECT {wanted} FROM history WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
     at = names.index("generation")
     for *values, evaluations, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = HistoryRow(values[at], tuple(values), evaluations, state, sha256)
-        yield row, not check or row_is_sound(heading, row)
+        yield row, not check or (row_is_sound(heading, row) and all(map(isinstance, values, types)))
 
 
 def row_is_sound(columns: bytes, row: HistoryRow) -> bool:

@@ -12,7 +12,9 @@ from typing import Any
 
 from es_service.errors import StoreError
 from es_service.loop.history import Column
+from es_service.protocol.messages import TaskSpec
 from es_service.store.codec import column_bytes, text_sha256
+from es_service.store.facts import Damaged, RunFacts, column_problem, facts, require_form
 
 SCHEMA = "schema_version"
 """Record of the table `meta` with the schema version."""
@@ -44,10 +46,6 @@ _CERTIFICATION = (
 OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
 """Columns of the table history besides those of the run: the evaluated centres (`tables.table_bytes`), the SHA-256 of
 the state, and that of the row."""
-
-
-class Damaged(Exception):  # noqa: N818 (caught inside the store, which then repairs or reports the damage)
-    """A database is damaged; the message describes the damage, with "it" for the file."""
 
 
 @dataclass(frozen=True)
@@ -96,14 +94,8 @@ def table_statements(columns: Sequence[Column]) -> dict[str, str]:
 def create_tables(connection: sqlite3.Connection, meta: RunMeta) -> None:
     """Create the tables of a run in an empty database and store its description. Raises StoreError if no table can have
     its columns."""
-    names = [column.name.casefold() for column in meta.columns]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    reserved = sorted(set(names) & set(OWN_HISTORY_COLUMNS))
-    if twice or reserved or ("generation", "INTEGER") not in [(column.name, column.type) for column in meta.columns]:
-        raise StoreError(
-            f"history columns: duplicate names {twice}, reserved names {reserved}; give each column its own name, and "
-            "include an INTEGER column `generation`"
-        )
+    if problem := column_problem(meta.columns, OWN_HISTORY_COLUMNS):
+        raise StoreError(problem)
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA auto_vacuum = NONE")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -127,18 +119,22 @@ def get_meta(connection: sqlite3.Connection, key: str) -> str | None:
 
 
 def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
-    """The description of the run, after its SHA-256 was checked.
+    """The description of the run, after its SHA-256 and its form were checked, and that the tables are those of a run:
+    a view in place of one could take for ever.
 
     Raises:
         Damaged: the description is damaged or missing.
         StoreError: `file` has another schema version.
     """
+    tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
+    if tables.get("meta", _META) != _META:
+        raise Damaged("its table meta is not that of a run")
     rows = connection.execute("SELECT key, value, sha256 FROM meta").fetchall()
     for key, value, sha256 in rows:
         if text_sha256(str(key), str(value)) != sha256:
             raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
     records = {key: value for key, value, _ in rows}
-    version = int(records.get(SCHEMA, 0))
+    version = facts(records.get(SCHEMA, "0"), int, "its schema version")
     if version > SCHEMA_VERSION:
         raise StoreError(
             f"{file} has schema version {version}; this version of es-service supports versions up to "
@@ -152,9 +148,13 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
             f"it (its schema version is {version}, and this version of es-service supports {OLDEST_VERSION} to "
             f"{SCHEMA_VERSION})"
         )
-    fields = json.loads(records["run"])
+    fields = facts(records["run"], RunFacts, "its description of the run", has_paths=True)
+    require_form(fields["task"], TaskSpec, "its description of the task")
     columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
-    return RunMeta(**fields | columns)
+    meta = RunMeta(**fields | columns)
+    if tables != table_statements(meta.columns):
+        raise Damaged("its tables are not those of a run")
+    return meta
 
 
 def quoted(name: str) -> str:

@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError
 from es_service.store.codec import row_dict
 from es_service.store.connection import connected_to, reading
+from es_service.store.facts import GENERATION, Damaged
 from es_service.store.folder import COPY
 from es_service.store.platforms import sound_platforms
-from es_service.store.reader import GENERATION
 from es_service.store.rows import HistoryRow, history_rows, newest_generation
-from es_service.store.schema import Damaged, RunMeta
+from es_service.store.schema import RunMeta
 from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_part, whole_states
 from es_service.store.tables import Columns, GrowingTable, table_rows
 
 Arrays = dict[str, NDArray[Any]]
-Kept = Callable[[str, Arrays], Arrays | None]
-"""Function (name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part."""
+Kept = Callable[[RunMeta, str, Arrays], Arrays | None]
+"""Function (the run, name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part. It raises
+ValueError for arrays that the run cannot have."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class SoundRun:
     """What is missing and why, one sentence each; empty if the run is sound as far as it was read."""
 
 
-def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundRun:
+def read_sound(folder: Path, kept: Kept = lambda meta, part, arrays: arrays) -> SoundRun:
     """Read a run as far as it is sound; see `SoundRun`. Parts are decoded one at a time, then passed to `kept`.
 
     Raises:
@@ -86,13 +87,15 @@ class Followed:
                 platforms = sound_platforms(connection)
             generation, parts = None, {}
             with _noted(problems, "the state cannot be read"):
-                generation, parts = self._state(connection, problems)
+                generation, parts = self._state(connection, meta, problems)
             # Nothing can be added to a table whose columns are in use.
             history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
             newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
             return SoundRun(meta, history, newest, evaluations, platforms, generation, parts, tuple(problems)), whole
 
-    def _state(self, connection: sqlite3.Connection, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
+    def _state(
+        self, connection: sqlite3.Connection, meta: RunMeta, problems: list[str]
+    ) -> tuple[int | None, dict[str, Arrays]]:
         """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
         stored = kept_rows(connection)
         generations = (newest_state(connection), newest_generation(connection))
@@ -110,7 +113,7 @@ class Followed:
             before = known.get(part)
             if before is None or before[0] != row:
                 try:
-                    before = row, self._kept(part, sound_part(connection, part, *row))
+                    before = row, self._kept(meta, part, sound_part(connection, part, *row))
                 except (sqlite3.Error, Damaged, ValueError):
                     damaged.append(part)
                     continue

@@ -27,8 +27,8 @@ from es_service.store.codec import (
     state_sha256,
     state_sum,
 )
+from es_service.store.facts import Damaged
 from es_service.store.rows import newest_generation
-from es_service.store.schema import Damaged
 
 KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
@@ -89,11 +89,14 @@ def whole_states(connection: sqlite3.Connection, kept: KeptRows) -> list[int]:
 
 
 def sound_part(connection: sqlite3.Connection, part: str, generation: int, sha256: str) -> dict[str, NDArray[Any]]:
-    """The arrays of a state row that was found. Raises Damaged if it does not match its SHA-256."""
+    """The arrays of a state row that was found. Raises Damaged if it does not match its SHA-256, or has no arrays."""
     payload = state_payload(connection, part, generation)
     if part_sha256(part, generation, payload) != sha256:
         raise Damaged(f"the state of {part!r} at generation {generation} does not match its SHA-256")
-    return decode_part(payload)
+    try:
+        return decode_part(payload)
+    except ValueError as error:
+        raise Damaged(f"the state of {part!r} at generation {generation} cannot be read: {error}") from error
 
 
 def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:

@@ -91,7 +91,7 @@ def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
 def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
     """The rows that `table_bytes` encoded, with values in the order of `columns`. Raises ValueError if `payload` does
     not consist of such rows."""
-    _require_rows(payload, len(columns))
+    _require_rows(payload, b"".join(b"(?:N|%b.{8})" % column.type[:1].encode() for column in columns))
     values = [_value(stored) for stored in re.findall(_VALUE, payload, re.DOTALL)]
     return [tuple(values[at : at + len(columns)]) for at in range(0, len(values), len(columns) or 1)]
 
@@ -99,13 +99,14 @@ def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
 def leading_values(payload: bytes, count: int, columns: int) -> bytes:
     """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each. Raises
     ValueError if `payload` does not consist of such rows."""
-    _require_rows(payload, columns)
+    _require_rows(payload, _VALUE * columns)
     rows = b"(%b{%d})%b{%d}" % (_VALUE, count, _VALUE, columns - count)
     return b"".join(re.findall(rows, payload, re.DOTALL))
 
 
-def _require_rows(payload: bytes, columns: int) -> None:
-    rows = re.match(b"(?:%b{%d})*+" % (_VALUE, columns), payload, re.DOTALL)
+def _require_rows(payload: bytes, row: bytes) -> None:
+    """Raise ValueError unless a payload consists of rows; `row` is the regular expression of one."""
+    rows = re.match(b"(?:%b)*+" % row, payload, re.DOTALL)
     if rows is None or rows.end() < len(payload):
         at = 0 if rows is None else rows.end()
         raise ValueError(f"the evaluated centres are unreadable from byte {at} on")

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from es_service.errors import StoreError
 from es_service.logs import logger
+from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DATABASE, LOG, is_disk_full
 from es_service.store.repair import make_copy, patience
-from es_service.store.schema import PAGE_BYTES, Damaged
+from es_service.store.schema import PAGE_BYTES
 
 _LOG = logger(__name__)
 LOCAL_COPY_INTERVAL_S = 180.0

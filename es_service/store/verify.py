@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from es_service.store import certifications
+from es_service.store.beginning import load_start
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
+from es_service.store.facts import Damaged
 from es_service.store.folder import is_no_damage
 from es_service.store.platforms import sound_platforms
 from es_service.store.rows import history_rows
-from es_service.store.schema import Damaged, RunMeta, load_meta, table_statements
+from es_service.store.schema import RunMeta, load_meta
 from es_service.store.states import KeptRows, whole_states
 
 MOST_NAMED = 8
@@ -71,10 +73,8 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     complaints = [row[0] for row in connection.execute("PRAGMA quick_check(3)")]
     if complaints != ["ok"]:
         raise Damaged(f"SQLite's quick_check reports: {'; '.join(complaints)}")
-    tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
-    if tables != table_statements(meta.columns):
-        raise Damaged("its tables are not those of a run")
     sound_platforms(connection)
+    load_start(connection)
     if connection.execute("SELECT min(generation) < 0 FROM history").fetchone()[0]:
         raise Damaged("it has a history row of a negative generation")
 
@@ -90,7 +90,7 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
     bad_certified = [key for key, row in certifications.rows(connection) if row is None]
-    problems += [f"row {rank} of certification {number} does not match its SHA-256" for number, rank in bad_certified]
+    problems += [f"row {rank} of certification {number} is damaged" for number, rank in bad_certified]
     return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certified), tuple(problems))
 
 

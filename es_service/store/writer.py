@@ -26,12 +26,13 @@ from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
 from es_service.store.create import create_run_folder
+from es_service.store.facts import Damaged
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound, patience
 from es_service.store.rows import history_rows, insert_history
-from es_service.store.schema import SCHEMA, SCHEMA_VERSION, Damaged, RunMeta, put_meta
+from es_service.store.schema import SCHEMA, SCHEMA_VERSION, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_state, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
@@ -120,14 +121,17 @@ class RunStore:
             raise explained(error, folder, "looking for a run") from error
         return cls(folder, acquire_lock(folder), hook)
 
+    def names(self) -> list[str]:
+        """Names of the parts of the newest generation's state."""
+        return self._kept.names()
+
     def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
         """State of the newest generation: part -> name -> array; empty before the first commit. Raises as `part`.
 
         Args:
             without: prefix of the names of parts that are left out; None to load all parts.
         """
-        names = self._kept.names()
-        return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
+        return {name: self.part(name) for name in self.names() if without is None or not name.startswith(without)}
 
     def part(self, name: str) -> dict[str, NDArray[Any]]:
         """One part of the newest generation's state: name -> array.

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from es_service.errors import ServiceError
 from es_service.runs.recent import FAULTS_OF, read_recent
-from es_service.watch.runs import FORGED, Summary
+from es_service.watch.runs import Summary
 
 GAUGES = {
     "generation": ("generation", "Newest committed generation."),
@@ -33,13 +33,10 @@ def metrics(summaries: Iterable[Summary]) -> str:
     values: dict[str, list[str]] = {name: [] for name in (*GAUGES, *OTHERS)}
     for summary in summaries:
         labels = {"run": summary.found.name}
-        try:
-            numbers = _values(summary)
-            if summary.status is not None:
-                constants = summary.status.run.constants
-                labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
-        except FORGED:
-            numbers = {"readable": 0.0}
+        numbers = _values(summary)
+        if summary.status is not None:
+            constants = summary.status.run.constants
+            labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
         shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labels.items())
         for name, value in numbers.items():
             if math.isfinite(value):

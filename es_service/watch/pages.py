@@ -18,7 +18,7 @@ from es_service.report.progress import short
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.run_status import state
 from es_service.watch.channels import Picture
-from es_service.watch.runs import FORGED, Found, Reading, Runs, Summary
+from es_service.watch.runs import Found, Reading, Runs, Summary
 
 SECTION_OF = {"charts": "curves", "map": "map", "cloud": "centres"}
 """Data of the page's script -> the section that they belong to."""
@@ -62,7 +62,7 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
         said = (
             f"{counted(len(summaries), 'run')}, {running:,} of them running." if summaries else "There is no run yet."
         )
-        rows = [tag("tr", *_row(summary)) for summary in summaries]
+        rows = [tag("tr", *_cells(summary)) for summary in summaries]
         heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
         listed = tag("div", tag("table", heads, tag("tbody", *rows), class_="runs"), class_="scroll") if rows else None
         choice = tag("button", "Compare the ticked runs", type="submit") if len(summaries) > 1 else None
@@ -74,14 +74,6 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
 
 def _is_running(summary: Summary) -> bool:
     return summary.status is not None and summary.status.driver is not None
-
-
-def _row(summary: Summary) -> list[Markup]:
-    """The cells of a row; a run with forged data hides no other."""
-    try:
-        return _cells(summary)
-    except FORGED as error:
-        return _cells(Summary(summary.found, None, None, f"its data are not those of a run: {error!r}"))
 
 
 def _cells(summary: Summary) -> list[Markup]:

@@ -20,7 +20,7 @@ from es_service.report.data import RunData, followed, run_data
 from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.view import open_run
-from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run
+from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run, leads_out
 from es_service.store.lock import lock_holder
 
 MOST_ROWS = 20_000
@@ -31,10 +31,6 @@ AGAIN_S = 30.0
 DEEPEST = 8
 """Levels of folders below a given one in which runs are found."""
 FILES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", f"{DATABASE}-journal", COPY, CONFIG, LOCK)
-
-
-FORGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-"""What data raise that a run of ours cannot have, although their hashes are right."""
 
 
 class Found(NamedTuple):
@@ -146,9 +142,8 @@ def seen_of(folder: Path) -> Mapping[str, Any]:
 
 def require_inside(run: Found) -> None:
     """Raise StoreError if the folder of a run, or one of its files, is a link out of the folder that was given."""
-    root = run.root.resolve()
     for name in ("", *FILES):
-        if not (run.folder / name).resolve().is_relative_to(root):
+        if leads_out(run.folder / name, run.root):
             what = f"{run.folder / name} is a link that leads out of {run.root}; it is not followed"
             raise StoreError(what, run=run.folder)
 
@@ -160,8 +155,6 @@ def _summary(run: Found) -> Summary:
         certified = newest_certified(run.folder)
     except ServiceError as error:
         return Summary(run, None, None, " ".join(error.sentence.split()))
-    except FORGED as error:
-        return Summary(run, None, None, f"its data are not those of a run: {error!r}")
     return Summary(run, status, certified, "")
 
 

@@ -111,7 +111,14 @@ def fill(place: Path, *case: Any) -> None:
     if config.map.enabled:
         parts = filled(parts, policy_spec(config, search.task).parameters, search.task.observation_size)
     columns = history_columns(search.task, config.map.enabled)
-    meta = RunMeta("benchmark", "", config.model_dump(mode="json"), config.constants(), asdict(search.task), columns)
+    meta = RunMeta(
+        f"{0:032x}",
+        "2025-01-01T00:00:00+00:00",
+        config.model_dump(mode="json"),
+        config.constants(),
+        asdict(search.task),
+        columns,
+    )
     beginning = Beginning(history=[memory.rows[0]], parts=parts, newest=0)
     RunStore.create(place, config.resolved_yaml(), meta, beginning).close()
 

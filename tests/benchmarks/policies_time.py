@@ -166,7 +166,14 @@ def measure(batch: int, generations: int, place: Path, given: argparse.Namespace
     initial = centres, no_observations(task.observation_size)
     search = driver.Search(config, ALGORITHMS["map_elites"](config), lambda: initial, task)
     columns = history_columns(task, True), evaluated_columns(task, True)
-    meta = RunMeta("benchmark", "", config.model_dump(mode="json"), config.constants(), asdict(task), *columns)
+    meta = RunMeta(
+        f"{0:032x}",
+        "2025-01-01T00:00:00+00:00",
+        config.model_dump(mode="json"),
+        config.constants(),
+        asdict(task),
+        *columns,
+    )
     spent: dict[str, float] = {}
     rows: list[dict[str, float]] = []
 

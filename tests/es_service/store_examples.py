@@ -1,21 +1,25 @@
 """A small run whose every generation is known: what the tests of the run store write and expect to read back."""
 
 import contextlib
+import json
 import math
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
+from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.loop.history import NO_INTEGER, Column
 from es_service.store import upkeep as store_upkeep
 from es_service.store.connection import reading
 from es_service.store.digest import digest_of, digest_parts
+from es_service.store.facts import Damaged
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_evaluations, read_history, read_parts
-from es_service.store.schema import Damaged
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
+from workers.environments import SHIPPED
 
 CONFIG_YAML = "seed: 0\n"
 COLUMNS = (
@@ -32,15 +36,25 @@ EVALUATION_COLUMNS = (
     Column("fitness_first", "REAL", False, ""),
 )
 CENTRES = 3
+CONFIG = {
+    **{"policy": {}, "search": {}, "budget": {}, "task": {"fitness": "sum"}},
+    "compute": dict.fromkeys(COMPUTE_CONSTANTS, 16),
+}
+CONSTANTS = {
+    **{"seed": 0, "task.environment": "point_maze", "task.episode_steps": 200, "search.algorithm": "es"},
+    **{"policy.hidden": [4], "policy.observation_clip": None, "policy.observation_normalization": False},
+    **{"map.enabled": False, "compute.rollout": "simd", "search.pairs": 8},
+}
+"""What every run says of itself."""
 
 
 def meta(**changes):
     fields = {
-        "run_id": "run-1",
+        "run_id": f"{1:032x}",
         "created": "2025-01-01T00:00:00+00:00",
-        "config": {"seed": 0, "search": {"pairs": 8}},
-        "constants": {"search.pairs": 8},
-        "task": {"name": "point_maze"},
+        "config": CONFIG,
+        "constants": CONSTANTS,
+        "task": json.loads(json.dumps(asdict(SHIPPED["point_maze"]))),
         "columns": COLUMNS,
         "evaluation_columns": EVALUATION_COLUMNS,
         "parent": None,

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from es_service.api import open_run
 from es_service.errors import StoreError
 from es_service.loop.parts import cell_part, elite_part
 from es_service.store import schema as store_schema
@@ -15,6 +14,7 @@ from es_service.store.writer import RunStore
 from tests.database import database, execute
 from tests.es_service.store_examples import (
     COLUMNS,
+    CONFIG,
     EVALUATION_COLUMNS,
     advance,
     as_table,
@@ -79,7 +79,7 @@ def test_equal_runs_have_equal_digests_however_they_were_written(folder, tmp_pat
 def test_layout_does_not_count(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(store_schema, "PAGE_BYTES", 1024)
     expected = digest(folder)
-    with create(tmp_path / "other", run_meta=meta(columns=COLUMNS[::-1], run_id="other")) as store:
+    with create(tmp_path / "other", run_meta=meta(columns=COLUMNS[::-1], run_id="b" * 32)) as store:
         for generation in range(GENERATIONS):
             parts = {
                 part: arrays and dict(reversed(arrays.items()))
@@ -107,7 +107,10 @@ def test_seconds_and_rates_do_not_count(folder):
 
 
 def test_platforms_and_meta_do_not_count(folder, tmp_path):
-    with create(tmp_path / "elsewhere", run_meta=meta(config={}, created="later")) as store:
+    with create(
+        tmp_path / "elsewhere",
+        run_meta=meta(config=CONFIG | {"search": {"pairs": 9}}, created="2026-01-01T00:00:00+00:00"),
+    ) as store:
         store.record_platform(0, {"cpu": "another"})
         advance(store, GENERATIONS - 1)
     assert digest(tmp_path / "elsewhere") == digest(folder)
@@ -219,8 +222,6 @@ def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):
     change(folder, "UPDATE history SET seconds_rollout = 1e9 WHERE generation = 3")  # which no digest would show
     with pytest.raises(StoreError, match=r"damaged: history row of generation 3 .*; .*\n.* resume\("):
         checked_parts(folder)
-    with pytest.raises(StoreError, match="damaged: history row of generation 3"):
-        open_run(folder).digest()
 
 
 def test_a_run_without_a_generation_has_a_digest(tmp_path):

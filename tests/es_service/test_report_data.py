@@ -275,7 +275,7 @@ def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
         parts, row = store.load(), store.last_history()
         committed = []
 
-        def kept(part, arrays):
+        def kept(meta, part, arrays):
             if not committed:
                 following = {**row, "generation": 21, "best_fitness": 0.0}
                 store.commit(21, {"best": {**parts["best"], "fitness": np.asarray(0.0)}}, following, [])

@@ -99,7 +99,7 @@ def test_all_text_of_a_user_is_escaped(tmp_path):
     )
     harmless = write_run(tmp_path / "run", {"task.options.way": "b", "search.init_from": str(tmp_path)}, task=plain)
     name = "".join(letter for letter in EVIL if letter not in "/\0")
-    parent = {"folder": EVIL, "generation": 3, "run_id": EVIL, "digest": EVIL}
+    parent = {"folder": EVIL, "generation": 3, "run_id": "a" * 32, "digest": "b" * 64}
     wanted = {f"task.options.{OPTION}": f"other{EVIL}", "search.init_from": str(tmp_path)}
     folder = write_run(tmp_path / name, wanted, task=evil, parent=parent)
     page = page_of(folder)

@@ -47,7 +47,7 @@ from tests.es_service.store_examples import (
 
 def test_a_new_run_has_its_files_and_no_generation(tmp_path):
     folder = tmp_path / "run"
-    parent = {"run_id": "a", "folder": "b", "generation": 3, "digest": "c"}
+    parent = {"run_id": "a" * 32, "folder": "b", "generation": 3, "digest": "c" * 64}
     with create(folder, run_meta=meta(parent=parent)) as run:
         assert run.generation is None
         assert run.last_history() is None

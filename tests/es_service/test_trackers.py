@@ -1,6 +1,8 @@
 """Trackers get every row of a history once, whatever happens to them, and nothing that they do reaches the run."""
 
 import importlib
+import json
+import os
 import struct
 import sys
 import threading
@@ -10,10 +12,12 @@ import numpy as np
 import pytest
 
 from es_service import open_run
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, StoreError
 from es_service.runs import tracking
 from es_service.runs.export import export
 from es_service.runs.trackers import PACKAGES, TensorBoard, _key, check_trackers, fill, metrics, open_tracker
+from es_service.store.codec import text_sha256
+from tests.database import execute
 from tests.run_examples import write_run
 
 NAME = "tensorboard"
@@ -284,3 +288,35 @@ def test_mlflow_has_every_row_once(folder, tmp_path, monkeypatch):
     history = client.get_metric_history(entry.info.run_id, "best_fitness")
     assert [one.step for one in history] == list(range(21))
     assert [one.value for one in history] == [row["best_fitness"] for row in open_run(folder).history_rows()]
+
+
+@pytest.mark.parametrize("name", ["x/../../../victim/thesis", "*", "' OR tags.a = 'b", "A" * 32, "a" * 31, "a" * 33])
+def test_a_run_whose_id_is_not_ours_reaches_no_path_pattern_or_query(tmp_path, name):
+    """It is refused when it is read, so an export deletes nothing elsewhere, and no tracker is asked for it."""
+    folder, victim = write_run(tmp_path / "run", generations=2), tmp_path / "victim"
+    victim.mkdir()
+    (victim / "thesis.txt").write_text("years of work")
+    (folder / "export/events.out.tfevents.1.x").mkdir(parents=True)
+    (folder / "export/events.out.tfevents.1.of_another_run.1").write_text("events")
+    run_as(folder, name)
+    with pytest.raises(StoreError, match=r"its description of the run: run_id: .*, not "):
+        export(open_run(folder), "tensorboard", folder / "export")
+    assert (victim / "thesis.txt").read_text() == "years of work"
+    assert (folder / "export/events.out.tfevents.1.of_another_run.1").exists()
+
+
+def run_as(folder, name):
+    """Give a run another id, with the SHA-256 that belongs to it."""
+    [(text,)] = execute(folder, "SELECT value FROM meta WHERE key = 'run'")
+    text = json.dumps(json.loads(text) | {"run_id": name})
+    execute(folder, "UPDATE meta SET value = ?, sha256 = ? WHERE key = 'run'", text, text_sha256("run", text))
+
+
+def test_an_export_of_events_replaces_those_of_the_same_run_only(folder):
+    there = [f"events.out.tfevents.1.host.{id_}.0" for id_ in (open_run(folder).run_id, "b" * 32)]
+    (folder / "export").mkdir()
+    for name in there:
+        (folder / "export" / name).write_text("old")
+    written = export(open_run(folder), "tensorboard", folder / "export")
+    assert there[0] not in os.listdir(folder / "export")
+    assert {file.name for file in written} | {there[1]} == {*os.listdir(folder / "export")}

@@ -265,8 +265,9 @@ def test_markup_in_every_name_is_shown_and_not_interpreted(tmp_path):
         SHIPPED["point_maze"], name=f"made:{MARKUP}", descriptor_names=names, summary=MARKUP, walls=None, goal=None
     )
     root = tmp_path / f"{MARKUP.replace('/', '')} $(id)"
+    parent = {"run_id": "a" * 32, "folder": MARKUP, "generation": 1, "digest": None}
     for seed in range(2):
-        write_run(root / f"{MARKUP}{seed}", {"seed": seed}, task=task, parent={"folder": MARKUP, "generation": 1})
+        write_run(root / f"{MARKUP}{seed}", {"seed": seed}, task=task, parent=parent)
     (root / "broken").mkdir()
     (root / "broken/run.db").write_text(MARKUP)
     app = site(root).app(None)
@@ -448,11 +449,11 @@ def test_a_run_with_forged_data_hides_no_other(tmp_path):
         connection.execute("UPDATE meta SET value = ?, sha256 = ? WHERE key = 'run'", row)
     app = site(tmp_path).app(None)
     html = sections(app, "/events/list")["sections"]["runs"]["html"]
-    assert "its data are not those of a run" in html
+    assert "its description of the run: constants.seed: Field required" in html
     assert "20 of 20" in html
     assert f'run="{tmp_path.name}/b",task="point_maze"' in get(app, "/metrics")[2]
     key = key_of(tmp_path, f"{tmp_path.name}/a")
-    assert "cannot be drawn" in sections(app, f"/events/run/{key}")["sections"]["live"]["html"]
+    assert "its description of the run" in sections(app, f"/events/run/{key}")["sections"]["live"]["html"]
 
 
 def test_on_a_shared_file_system_the_copy_is_watched_while_a_driver_writes(tmp_path, monkeypatch):
