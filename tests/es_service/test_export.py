@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 
 import numpy as np
@@ -12,6 +13,7 @@ from es_service.errors import StoreError
 from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
 from tests.database import execute
+from tests.run_examples import write_run
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 FIRST, LAST = 2, 8
@@ -93,3 +95,23 @@ def test_a_damaged_export_is_found_by_sha256sum(run, tmp_path):
     (tmp_path / "export" / "SHA256SUMS").write_bytes((tmp_path / "export" / "SHA256SUMS").read_bytes() + b"\xff\0  x\n")
     export(run, "npz", tmp_path / "export")
     assert failed(tmp_path / "export") == set(), "what is gone or no file is left out"
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet", "npz", "ribs", "tensorboard"])
+def test_links_of_a_strangers_run_are_not_written_through(tmp_path, to):
+    folder, victim = write_run(tmp_path / "run"), tmp_path / "victim"
+    export(api.open_run(folder), to, tmp_path / "names")
+    names = [path.name for path in (tmp_path / "names").iterdir()]
+    victim.mkdir()
+    (folder / "export").mkdir()
+    for name in names:
+        (victim / name).write_text("thesis")
+        (folder / "export" / name).symlink_to(victim / name)
+    written = export(api.open_run(folder), to, folder / "export")
+    assert all(path.is_file() and not path.is_symlink() for path in written)
+    assert {path.name: path.read_text() for path in victim.iterdir()} == dict.fromkeys(names, "thesis")
+    shutil.rmtree(folder / "export")
+    (folder / "export").symlink_to(victim)
+    with pytest.raises(StoreError, match=r"export is a link that leads out of .*run; name the folder to write into"):
+        export(api.open_run(folder), to, folder / "export")
+    assert len([*victim.iterdir()]) == len(names)

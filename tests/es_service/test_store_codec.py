@@ -1,4 +1,5 @@
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -31,6 +32,21 @@ ARRAYS = {
 
 def test_a_part_comes_back_bit_for_bit_with_types_and_shapes():
     assert_same_state({"part": decode_part(encode_part(ARRAYS))}, {"part": ARRAYS})
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        *(f'[["x", "<f4", {shape}]]' for shape in ("[1.5]", "[-1]", "[null]", "[[1]]", "3", "{}", f"[0, {2**70}]")),
+        *(f'[["x", {kind}, [1]]]' for kind in ('"|O"', '"<f3"', '"(9,)f4"', '"M8[s]"', '["<f4"]', "null", '"<f16,"')),
+        *("[" * 100_000, "{}", "[1]", '[["x", "<f4"]]', '[[3, "<f4", [1]]]', '[["x", "<f4", [0]], ["x", "<f4", [1]]]'),
+    ],
+)
+def test_any_other_header_is_a_value_error(header):
+    """As the readers of a forged run rely on."""
+    text = header.encode()
+    with pytest.raises(ValueError, match="a state payload"):
+        decode_part(b"ESP1" + struct.pack("<I", len(text)) + text + bytes(8))
 
 
 def test_decoded_arrays_can_be_written_to():

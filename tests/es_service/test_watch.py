@@ -439,17 +439,29 @@ def test_running_runs_come_first(tmp_path):
     assert re.findall(r'">[^<]*/([abc])</a>', html) == ["b", "a", "c"]
 
 
-def test_a_run_with_forged_data_hides_no_other(tmp_path):
+@pytest.mark.parametrize(
+    ("forged", "said"),
+    [
+        (lambda run: json.dumps(run | {"constants": {"task.environment": 3}}), "constants.seed: Field required"),
+        (lambda run: "[" * 100_000, "cannot be read: maximum recursion depth"),
+        (
+            lambda run: json.dumps(run | {"config": json.loads("[" * 99 + "]" * 99)}),
+            "has more than 32 lists and mappings",
+        ),
+    ],
+)
+def test_a_run_with_forged_data_hides_no_other(tmp_path, forged, said):
     for name in ("a", "b"):
         write_run(tmp_path / name)
     with database(tmp_path / "a/run.db") as connection:
         [text] = connection.execute("SELECT value FROM meta WHERE key = 'run'").fetchone()
-        text = json.dumps(json.loads(text) | {"constants": {"task.environment": 3}})
+        text = forged(json.loads(text))
         row = (text, text_sha256("run", text))
         connection.execute("UPDATE meta SET value = ?, sha256 = ? WHERE key = 'run'", row)
     app = site(tmp_path).app(None)
     html = sections(app, "/events/list")["sections"]["runs"]["html"]
-    assert "its description of the run: constants.seed: Field required" in html
+    assert "its description of the run" in html
+    assert said in html
     assert "20 of 20" in html
     assert f'run="{tmp_path.name}/b",task="point_maze"' in get(app, "/metrics")[2]
     key = key_of(tmp_path, f"{tmp_path.name}/a")
