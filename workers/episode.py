@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
@@ -19,7 +20,7 @@ from workers.environments import Environment
 from workers.outputs import Step, named_outputs
 from workers.policies.outputs import action, drawn_action
 from workers.policies.policy import initial_memory, normalise
-from workers.rollouts.backend import Episodes
+from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
 
 
 class Carry(NamedTuple):
@@ -39,13 +40,18 @@ class EpisodeSteps(NamedTuple):
     """Function from the stream key of the reset to a carry."""
     normalised_observation: Callable[[Carry, Any, Any], Any]
     """Function (carry, mean_O, std_O) -> normalised observation [O]."""
-    advance: Callable[[Carry, Any, Any, Any], Carry]
-    """Function (carry, mean_O, outputs of the policy's last layer, stream key of the action noise) -> carry; only
-    training uses the key. The memory stays."""
+    advance: Callable[[Carry, Any, Any, Any, Any], Carry]
+    """Function (carry, mean_O, normalised observation, outputs of the policy's last layer, stream key of the action
+    noise) -> carry; only training uses the key. The memory stays."""
 
 
 def episode_steps(
-    environment: Environment, spec: WorkerSpec, *, training: bool, inputs_O: Any = slice(None)
+    environment: Environment,
+    spec: WorkerSpec,
+    *,
+    training: bool,
+    inputs_O: Any = slice(None),
+    finds_faults: bool = True,
 ) -> EpisodeSteps:
     """Step functions of training episodes (action noise, sums of observations) or of evaluation episodes (traces).
 
@@ -54,12 +60,16 @@ def episode_steps(
 
     Args:
         inputs_O: indices of the environment's observations that are computed, for the policy and for the sums.
+        finds_faults: whether episodes say where something was not finite (`Episodes.fault`). Otherwise the results of
+            an episode whose policy was given such an input are not all finite, at the least cost: in training the sums
+            of its observations, in evaluations its return.
     """
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
     action_size = spec.policy.widths[-1]
     noisy = spec.action_noise > 0.0
     named = named_outputs(spec.outputs)
     points = min(TRACE_POINTS, spec.episode_steps + 1)
+    numbers_O = np.arange(spec.policy.widths[0], dtype=np.int32)[inputs_O]
     last_steps_T = (np.arange(points) * spec.episode_steps // (points - 1)).astype(np.int32)
 
     def observe(state: Any) -> Any:
@@ -82,6 +92,7 @@ def episode_steps(
             trace_T_B=trace_T_B,
             outputs={name: output.begin(environment, state, zeros_A) for name, output in named.items()},
             of_steps={},
+            fault=jnp.array([0, NO_FAULT], jnp.int32) if finds_faults else None,
         )
         return Carry(state, jnp.array(True), initial_memory(jnp, spec.policy), nothing)
 
@@ -100,7 +111,24 @@ def episode_steps(
         reached_T = steps + 1 <= last_steps_T
         return jnp.where(reached_T[:, None], descriptor_B, trace_T_B)
 
-    def advance(carry: Carry, mean_O: Any, outputs: Any, action_key: Any) -> Carry:
+    def fault(carry: Carry) -> Any:
+        """`Episodes.fault` after a step that begins with this carry.
+
+        It looks at observations, since what a policy makes of them may hide a NaN, as a choice among actions does, and
+        behind a barrier, because another use of a value would change which operations XLA fuses, and so their bits. For
+        the same reason a reward is seen in the return, a step later.
+        """
+        state, before = lax.optimization_barrier((carry.state, carry.episode))
+        observation_O = observe(state)
+        is_bad_O = jnp.isnan(observation_O) if spec.observation_clip is not None else ~jnp.isfinite(observation_O)
+        number = jnp.where(is_bad_O, numbers_O, np.int32(NO_FAULT)).min()
+        step = before.steps + (number != NO_FAULT)
+        number = jnp.minimum(number, jnp.where(jnp.isfinite(before.returns), np.int32(NO_FAULT), np.int32(BAD_REWARD)))
+        any_input = np.int32(BAD_REWARD - 1)
+        is_graver = jnp.maximum(number, any_input) < jnp.maximum(before.fault[1], any_input)
+        return jnp.where(is_graver, jnp.stack([step, number]), before.fault)
+
+    def advance(carry: Carry, mean_O: Any, x_O: Any, outputs: Any, action_key: Any) -> Carry:
         alive, before = carry.alive, carry.episode
         if training:
             action_A = training_action(outputs, action_key, before.steps)  # a living episode has done as many steps
@@ -111,6 +139,9 @@ def episode_steps(
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
         returns = before.returns + reward
+        if not training and not finds_faults:
+            total = x_O.sum()
+            returns = returns + (total - total)  # 0 if all are finite, else NaN
         shifted_O = observe(carry.state) - mean_O if training else before.shifted_sum_O
         after = Episodes(
             fitness=reward if spec.fitness == "final" else returns,
@@ -123,6 +154,7 @@ def episode_steps(
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
             outputs={name: output.after(environment, step, before.outputs[name]) for name, output in named.items()},
             of_steps={},
+            fault=fault(carry) if finds_faults else None,
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
         return Carry(state, alive & ~done, carry.memory_H, masked)

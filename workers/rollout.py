@@ -226,7 +226,7 @@ def _make_episodes(
     steps = episode_steps(environment, spec, training=training)
     of_statistics = 0 if per_lane_statistics else None
     observe = jax.vmap(steps.normalised_observation, in_axes=(0, of_statistics, of_statistics))
-    advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0))
+    advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0, 0))
 
     def episodes(policies: Policies, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
@@ -236,8 +236,9 @@ def _make_episodes(
 
         def body(at: tuple[Any, Carry, Any, Carry | None]) -> tuple[Any, Carry, Any, Carry | None]:
             step, carry, of_steps_T_L, seen_T = at
-            outputs_L, memory_L_H = policies(carry.memory_H, observe(carry, mean_O, std_O))
-            moved = advance(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
+            x_L_O = observe(carry, mean_O, std_O)
+            outputs_L, memory_L_H = policies(carry.memory_H, x_L_O)
+            moved = advance(carry, mean_O, x_L_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
             of_steps_T_L = {name: kept.at[step].set(moved.episode.outputs[name]) for name, kept in of_steps_T_L.items()}
             return step + 1, moved, of_steps_T_L, keep(seen_T, step, carry)
 

@@ -208,8 +208,7 @@ def _policy_results(
     results, start = [], 0
     for subject, chunk in work:
         _, episode_L = slots(subject, chunk)
-        of_chunk = slice(start, start + len(episode_L))
-        part = episodes.map(lambda array, of=of_chunk: array[of])
+        part = episodes.part(slice(start, start + len(episode_L)))
         result = policies_result(part, episode_L == 0 if subject.traces else None)
         results.append(_with_failures(spec, (subject, chunk), part, result))
         start += len(episode_L)
@@ -279,11 +278,8 @@ def _ids(chunks: Sequence[Chunk], size: int) -> Any:
 
 
 def _split(episodes: Episodes, size: int) -> list[Episodes]:
-    """Episodes of several chunks as those of each, `size` along the first axis; in JAX's memory if they were."""
-    count = len(episodes.fitness) // size
-    if count == 1:
-        return [episodes]
-    return [episodes.map(lambda array, of=slice(i * size, (i + 1) * size): array[of]) for i in range(count)]
+    """Episodes of several chunks as those of each, `size` along the first axis."""
+    return [episodes.part(slice(first, first + size)) for first in range(0, len(episodes.fitness), size)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

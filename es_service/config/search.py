@@ -42,7 +42,8 @@ class SearchConfig(Section):
         30, description="Noise-free episodes on which each new centre is evaluated; they count as environment steps."
     )
     max_invalid_fraction: Fraction = Field(
-        0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
+        0.5,
+        description="Share of invalid members, in whose episodes something is not finite, above which the run stops.",
     )
     allow_infeasible: Switch = Field(
         False,

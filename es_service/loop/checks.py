@@ -201,7 +201,7 @@ def invalidate(
         which = " and ".join(f"a {name} that is not finite ({count:,})" for name, count in counts.items() if count)
         hints = [f"smaller values of {one_of(search.spread_by, 'and')} may help"] if search.spread_by else []
         if told:
-            which, hints = "no valid result", [*hints, f"the first of which more is known: {told[0]}"]
+            which, hints = "no valid result", [f"the first: {told[0]}"]
         elif infeasible > allowed:
             hints = [INFEASIBLE]
         raise EvaluationError(

@@ -33,8 +33,9 @@ All methods are pure functions of one state that JAX can trace; they are batched
 `es_service.protocol.noise.uniforms(key, counters)` makes random numbers of the key of `reset`, which is no key of JAX;
 `jax.random.wrap_key_data(key[:2])` makes one of it, which the functions of `jax.random` accept. In training, actions
 may exceed [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the output, and the output `linear`
-has no bounds; a task that needs bounded actions must clip them. Observations are summed in float32, so their mean must
-be less than a thousand standard deviations from 0.
+has no bounds; a task that needs bounded actions must clip them.
+Observations and rewards are rounded to float32; with xla a task may compute in double precision (`jax_enable_x64`).
+Observations are summed in float32, so their mean must be less than a thousand standard deviations from 0.
 """
 
 from __future__ import annotations
@@ -165,6 +166,9 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
         state, reward, done = task.step(state, action)
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
+    def observe(state: Any) -> Any:
+        return jnp.asarray(task.observe(state), jnp.float32)
+
     def reset(key: Any) -> Any:
         try:
             return task.reset(key)
@@ -175,7 +179,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
 
     viewer = task.viewer() if hasattr(task, "viewer") else None
     success = getattr(task, "success", lambda state, before: before)
-    return Environment(reset, task.observe, step, task.descriptor, goal_distance, success, viewer)
+    return Environment(reset, observe, step, task.descriptor, goal_distance, success, viewer)
 
 
 def _wants_jax_key(error: Exception) -> bool:

@@ -6,7 +6,7 @@ Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import isfinite
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from workers.environments.host_task import HostEnvironment, HostTask
 from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
 from workers.host.seeds import seed_of
-from workers.rollouts.backend import Episodes, FailedEpisode, raised_in_lane
+from workers.rollouts.backend import Episodes, FailedEpisode, observation_text, raised_in_lane
 
 SHOWN = 4
 """Parameters of a policy that a message shows."""
@@ -90,7 +90,9 @@ def run_episodes(
     sum_L_O, square_L_O = np.zeros((2, count, size if training else 0), np.float32)
     trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
     outputs = Outputs(spec.outputs, spec, task, count)
-    bad_reward_L: dict[int, tuple[int, float]] = {}  # lane -> (step, value) of its first reward that is not finite
+    bad_observation_L: dict[int, str] = {}  # lane -> the first observation on which no policy can act
+    is_bad = np.isnan if spec.observation_clip is not None else _is_not_finite
+    bad_reward_L: dict[int, str] = {}  # lane -> its first reward that is not finite
 
     def watch(lane: int, environment: HostEnvironment) -> None:
         if watched is not None and watched.lane == lane:
@@ -108,6 +110,11 @@ def run_episodes(
             if not running:
                 break
             action_L_A = policies(observation_L_O, step - 1)
+            is_bad_L_O = is_bad(observation_L_O)
+            if is_bad_L_O.any():
+                for bad, number in np.argwhere(is_bad_L_O & alive_L[:, None]).tolist():
+                    value = observation_L_O[bad, number]
+                    bad_observation_L.setdefault(bad, f"{observation_text(number, step)} is {value:g}")
             actions_L = task.actions(action_L_A)
             if training:
                 with np.errstate(over="ignore", invalid="ignore"):
@@ -126,7 +133,8 @@ def run_episodes(
                 reward_L[lane], steps_L[lane] = reward, step
                 returns_L[lane] += reward
                 if not isfinite(reward):
-                    bad_reward_L.setdefault(lane, (step, reward))
+                    hint = f"; {INFEASIBLE}" if reward == -inf else ""
+                    bad_reward_L.setdefault(lane, f"the reward of step {step} is {reward:g}{hint}")
                 if task.goal_distance is not None:
                     distance = environment.goal_distance()
                     goal_distance_L_2[lane] = distance, np.fmin(goal_distance_L_2[lane, 1], distance)
@@ -150,12 +158,14 @@ def run_episodes(
         known_from_the_start(trace_T_B)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, which makes the episode invalid
         returns_L, reward_L = returns_L.astype(np.float32), reward_L.astype(np.float32)
+    returns_L[[*bad_observation_L]] = reward_L[[*bad_observation_L]] = np.nan
     failures = []
     for lane in np.flatnonzero(steps_L > 0).tolist():
         fitness = reward_L[lane] if spec.fitness == "final" else returns_L[lane]
         if spec.allow_infeasible and fitness == -np.inf:
             continue
-        if why := _why_invalid(bad_reward_L.get(lane), returns_L[lane], descriptor_L_B[lane]):
+        why = bad_observation_L.get(lane) or bad_reward_L.get(lane)
+        if why := why or _why_invalid(returns_L[lane], descriptor_L_B[lane]):
             shown = shown_parameters(parameters_L_D[lane])
             failures.append(
                 FailedEpisode(lane, f"(seed {seed_of(reset_keys_L_4[lane])}): {why}; its policy has {shown}")
@@ -175,15 +185,12 @@ def run_episodes(
     )
 
 
-def _why_invalid(bad_reward: tuple[int, float] | None, returns: np.float32, descriptor_B: FloatArray) -> str:
-    """Why an episode is invalid; empty if it is valid.
+def _is_not_finite(array: FloatArray) -> NDArray[np.bool_]:
+    return ~np.isfinite(array)
 
-    Args:
-        bad_reward: step and value of its first reward that is not finite; None if all are.
-    """
-    if bad_reward is not None:
-        hint = f"; {INFEASIBLE}" if bad_reward[1] == -np.inf else ""
-        return f"the reward of step {bad_reward[0]} is {bad_reward[1]:g}{hint}"
+
+def _why_invalid(returns: np.float32, descriptor_B: FloatArray) -> str:
+    """What is not finite among the results of an episode; empty if all are."""
     if not np.isfinite(returns):
         return f"the sum of its rewards is {returns:g}, beyond what float32 holds"
     if not np.isfinite(descriptor_B).all():

@@ -1,4 +1,4 @@
-"""Step a task of Python objects with random actions, or call a function, to see whether it repeats itself and how fast.
+"""Try a task: whether its numbers are finite, and one of Python objects or a function whether it repeats and how fast.
 
     python -m workers.host.examine NAME SETTINGS SECONDS     # what `workers.describe` takes, and how long to measure
 
@@ -13,25 +13,32 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from es_service.protocol.messages import TaskSpec
-from es_service.protocol.noise import Domain, normal_integers, stream_keys
+from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
+from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.raised import raised
+from es_service.protocol.rollouts import choose
 from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
 from workers.environments import TaskError, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment
+from workers.policies.policy import initial_parameters
+from workers.rollouts import BACKENDS
 
 STEPS = 200
 """Most steps of an episode that is compared."""
 BESIDE = 3
 """Objects that step beside the first."""
+TRIED = 8
+"""Random policies that are tried."""
 SEED, OTHER_SEED = 1, 2
+EXTREME = np.float32(30.0)
+"""Factor of the parameters of initial policies with which their actions are both small and great."""
 ALONE = "alone"
 """Name of the first episode among the hashes; the others are to equal it."""
 
@@ -42,11 +49,13 @@ class Examined:
 
     hashes: dict[str, str]
     """Trial -> hash of all that the object returned: ALONE in a new object, and then the same once more after
-    another episode, and beside other objects."""
+    another episode, and beside other objects. Empty for tasks in JAX."""
     steps_per_second: float
-    """Steps of one core, or calls of a function."""
+    """Steps of one core, or calls of a function; 0 for tasks in JAX."""
     peak_mib: int
     """Most memory of the process, in MiB."""
+    fault: str = ""
+    """What is not finite in the first such episode of random policies, with its reset; empty if all is."""
 
 
 def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) -> Examined:
@@ -63,6 +72,8 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
 
         hashes = {ALONE: call(SEED), "after another call": (call(OTHER_SEED), call(SEED))[1]}
         return _measured(hashes, lambda: (call(SEED), 1)[1], seconds)
+    if task.kind == "jax":
+        return Examined({}, 0.0, peak_memory_mib(), _fault(task, options))
     made, key = make_host_task(task.name, options), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
     coordinates = np.arange(STEPS * task.action_size, dtype=np.uint32)
     action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
@@ -93,7 +104,39 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
     hashes["after another episode"] = episodes([environment], [SEED])[0]
     several = [HostEnvironment(made) for _ in range(1 + BESIDE)]
     hashes["beside other objects"] = episodes(several, [SEED, *range(OTHER_SEED, OTHER_SEED + BESIDE)])[0]
-    return _measured(hashes, lambda: episodes([environment], [SEED])[1], seconds)
+    measured = _measured(hashes, lambda: episodes([environment], [SEED])[1], seconds)
+    return replace(measured, fault=_fault(task, options))
+
+
+def _fault(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
+    """See `Examined.fault`. The episodes are those of a worker, which knows what makes an episode invalid."""
+    policy = PolicySpec((task.observation_size, 16, task.action_size))
+    rollout = choose(BACKENDS, task, policy, gpu=False, here=True)
+    spec = WorkerSpec(
+        seed=SEED,
+        environment=task.name,
+        environment_options=dict(options),
+        policy=policy,
+        episode_steps=min(STEPS, task.episode_steps),
+        fitness="sum",
+        episodes_per_member=1,
+        observation_clip=None,
+        action_noise=0.0,
+        common_random_numbers=True,
+        chunk_pairs=1,
+        rollout_block_pairs=1,
+        gradient_block_pairs=1,
+        rollout=rollout,
+        allow_infeasible=True,
+    )
+    parameters_L_D = np.stack(
+        [EXTREME * initial_parameters(policy, "unit_columns", SEED, lane) for lane in range(TRIED)]
+    )
+    mean_L_O, std_L_O = (np.full((TRIED, task.observation_size), value, np.float32) for value in (0.0, 1.0))
+    keys_L_4 = evaluation_reset_keys(SEED, 0, np.arange(TRIED), 0)
+    function = BACKENDS[rollout].chunk_functions(spec).policies
+    failures = function([parameters_L_D], mean_L_O, std_L_O, np.arange(TRIED), keys_L_4).failures
+    return failures[0].text if failures else ""
 
 
 def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -> Examined:

@@ -20,13 +20,17 @@ _LANE = "_es_service_lane"
 """Attribute of an exception that was raised in an episode."""
 
 
+BAD_REWARD, NO_FAULT = 2**31 - 2, 2**31 - 1
+"""Second numbers of `Episodes.fault`, greater than that of any observation."""
+
+
 class FailedEpisode(NamedTuple):
-    """Why an episode is invalid, where the rollout knows it."""
+    """Why an episode is invalid."""
 
     lane: int
     """Place of its policy in the chunk: of a training chunk 2 p + s for member s of pair p, of others the slot."""
     text: str
-    """Text after the name of the member: its seed and parameters, and the reason."""
+    """Text after the name of the member: the seed or key of its reset, the reason, and its parameters if known."""
 
 
 class Episodes(NamedTuple):
@@ -55,14 +59,26 @@ class Episodes(NamedTuple):
     of_steps: dict[str, Any]
     """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.outputs.OF_STEPS`). Rows from `steps`
     on may be anything."""
+    fault: Any = None
+    """[..., 2] int32 of a JAX task: the step, counted from 1, in which something first was not finite, and what: the
+    number of the observation on which the policy acted, or else BAD_REWARD for the return; NO_FAULT if nothing was
+    before the last step. None if the rollout has looked itself."""
     failures: tuple[FailedEpisode, ...] = ()
-    """Invalid episodes of which the rollout knows more."""
+    """Invalid episodes by name."""
 
     def map(self, function: Callable[[Any], Any]) -> Episodes:
         """The episodes with a function of each array in its place."""
-        *arrays, at_the_end, of_steps, failures = self
+        *arrays, at_the_end, of_steps, fault, failures = self
         named = ({name: function(array) for name, array in of.items()} for of in (at_the_end, of_steps))
-        return Episodes._make([*map(function, arrays), *named, failures])
+        return Episodes._make([*map(function, arrays), *named, None if fault is None else function(fault), failures])
+
+    def part(self, of: slice) -> Episodes:
+        """Those in a slice of the first axis, which names its start and end, with the failures among them."""
+        lanes = 1 if self.fitness.ndim == 1 else self.fitness.shape[1]  # of the members of a pair
+        first, end = of.start * lanes, of.stop * lanes
+        failures = (failed for failed in self.failures if first <= failed.lane < end)
+        part = self.map(lambda array: array[of])
+        return part._replace(failures=tuple(FailedEpisode(lane - first, text) for lane, text in failures))
 
     def with_steps(self, of_steps: Mapping[str, Any]) -> Episodes:
         """The episodes with these values of all steps, in place of those after the newest."""
@@ -70,6 +86,11 @@ class Episodes(NamedTuple):
             outputs={name: array for name, array in self.outputs.items() if name not in of_steps},
             of_steps=dict(of_steps),
         )
+
+
+def observation_text(number: int, step: int) -> str:
+    """An observation on which the policy acted in a step, counted from 1, in words."""
+    return f"observation[{number}] of {'the reset' if step == 1 else f'step {step - 1}'}"
 
 
 def raised_in_lane(error: BaseException, lane: int) -> None:

@@ -124,12 +124,13 @@ def _in_lanes(array: np.ndarray, lanes: int) -> np.ndarray:
 
 def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
     """Episodes [L] of each of a member's episodes as [L, E]."""
-    columns = (np.stack(arrays, axis=1) for arrays in zip(*(episodes[:-3] for episodes in by_episode), strict=True))
+    columns = (np.stack(arrays, axis=1) for arrays in zip(*(episodes[:-4] for episodes in by_episode), strict=True))
     named = (
         {name: np.stack([values[name] for values in each], axis=1) for name in each[0]}
         for each in ([episodes.outputs for episodes in by_episode], [episodes.of_steps for episodes in by_episode])
     )
-    return Episodes._make([*columns, *named, tuple(failed for episodes in by_episode for failed in episodes.failures)])
+    failures = tuple(failed for episodes in by_episode for failed in episodes.failures)
+    return Episodes._make([*columns, *named, None, failures])
 
 
 def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recording:

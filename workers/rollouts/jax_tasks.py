@@ -1,4 +1,5 @@
-"""Code shared by rollouts of JAX tasks: recording an episode that was watched, and steps with random actions."""
+"""Code shared by rollouts of JAX tasks: which episodes are invalid and why, recordings of episodes that were watched,
+and steps with random actions."""
 
 from __future__ import annotations
 
@@ -10,12 +11,68 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import environments
+from workers.compilable import Compilable
+from workers.rollouts.backend import (
+    BAD_REWARD,
+    NO_FAULT,
+    ChunkFunctions,
+    Episodes,
+    FailedEpisode,
+    observation_text,
+)
 from workers.viewer import shapes
+
+
+def judged(functions: ChunkFunctions, spec: WorkerSpec) -> ChunkFunctions:
+    """The functions of a run's rollout that finds faults, with episodes that are invalid where the policy acted on an
+    observation that is NaN, or infinite and not clipped, and with the names of all that are invalid.
+    """
+
+    def function(of: Compilable, reset_keys: int, wanted: int | None = None) -> Compilable:
+        """`of`, which has reset keys, and whether lanes are wanted, as arguments with these numbers."""
+
+        def run(*given: Any) -> Episodes:
+            return _judged(of(*given), given[reset_keys], True if wanted is None else given[wanted], spec)
+
+        return Compilable(run, of.compile)
+
+    return functions._replace(
+        training=function(functions.training, 5),
+        evaluation=function(functions.evaluation, 3, 4),
+        policies=function(functions.policies, 4),
+    )
+
+
+def _judged(episodes: Episodes, reset_keys: Any, is_wanted: Any, spec: WorkerSpec) -> Episodes:
+    episodes = episodes.map(np.asarray)
+    step, number = episodes.fault[..., 0], episodes.fault[..., 1]
+    fitness, returns = (
+        np.where(number < BAD_REWARD, np.float32(np.nan), x) for x in (episodes.fitness, episodes.returns)
+    )
+    is_invalid = ~(np.isfinite(fitness) & np.isfinite(episodes.descriptor).all(axis=-1)) & is_wanted
+    if spec.allow_infeasible:
+        is_invalid &= fitness != -np.inf
+    bad_observation = "NaN" if spec.observation_clip is not None else "NaN or infinite"
+    failures = []
+    for at in map(tuple, np.argwhere(is_invalid)):
+        if number[at] < BAD_REWARD:
+            why = f"{observation_text(number[at], step[at])} is {bad_observation}"
+        elif not np.isfinite(returns[at]):
+            last = episodes.steps[at] if number[at] == NO_FAULT else step[at]
+            hint = f"; {INFEASIBLE}" if returns[at] == -np.inf else ""
+            why = f"the reward of step {last} is NaN or infinite, or the sum of rewards with it{hint}"
+        else:
+            why = f"its descriptor is {episodes.descriptor[at].tolist()}"
+        key = ", ".join(map(str, reset_keys[at]))
+        lane = at[0] if len(at) == 1 else at[0] * fitness.shape[1] + at[1]
+        failures.append(FailedEpisode(int(lane), f"(key of its reset: {key}): {why}"))
+    return episodes._replace(fitness=fitness, returns=returns, fault=None, failures=tuple(failures))
 
 
 def record(

@@ -53,6 +53,7 @@ class Simd(RolloutBackend):
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.simd.episodes.rollout`."""
+        from workers.rollouts.jax_tasks import judged
         from workers.simd.episodes import low_rank_gradient, rollout
 
         gpu = on_gpu()
@@ -67,7 +68,7 @@ class Simd(RolloutBackend):
             from workers.simd.gpu.rollout import episodes_on_gpu
 
             elsewhere = episodes_on_gpu(environment, spec)
-        return ChunkFunctions(
+        functions = ChunkFunctions(
             rollout.make_training_rollout(environment, spec, elsewhere),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
@@ -75,6 +76,7 @@ class Simd(RolloutBackend):
             if spec.noise_rank
             else rollout.make_gradient_sum(spec.policy.parameters),
         )
+        return judged(functions, spec)
 
     def device(self) -> str:
         """The kind of the GPU."""

@@ -29,13 +29,14 @@ class Xla(RolloutBackend):
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.rollout`."""
         from workers import rollout
+        from workers.rollouts.jax_tasks import judged
         from workers.scatters import without_scatters
 
         environment = environments.make_environment(spec.environment, spec.environment_options)
         if gpu := on_gpu():
             reset, step = without_scatters(environment.reset), without_scatters(environment.step)
             environment = replace(environment, reset=reset, step=step)
-        return ChunkFunctions(
+        functions = ChunkFunctions(
             rollout.make_training_rollout(environment, spec, in_pairs=gpu),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
@@ -43,6 +44,7 @@ class Xla(RolloutBackend):
             if spec.noise_rank
             else rollout.make_gradient_sum(spec.policy.parameters),
         )
+        return judged(functions, spec)
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""

@@ -76,7 +76,7 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     statistics = [np.broadcast_to(x[:, inputs_O], (LANES, len(inputs_O))).T.view(np.uint32) for x in (mean_O, std_O)]
     x_I_L = np.stack(evaluate(normalised_observation, seen, np.concatenate([carry_L, *statistics])))
     action_A_L = reference.policy(spec.policy, inputs_O, x_I_L, weights_of, **moved)
-    words = np.concatenate([carry_L, statistics[0], action_A_L.view(np.uint32), keys_L.T])
+    words = np.concatenate([carry_L, statistics[0], x_I_L.view(np.uint32), action_A_L.view(np.uint32), keys_L.T])
     require_same(_by_lane(carries), as_words(evaluate(advance, after, words)), f"a step of {spec.environment}")
 
 

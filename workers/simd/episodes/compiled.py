@@ -189,6 +189,7 @@ def compile_episodes(
     *,
     training: bool,
     per_lane_weights: bool = False,
+    finds_faults: bool = False,
     target: Target | None = None,
     folder: Path | None = None,
     check: Callable[[EpisodeKernel, EpisodeProgram], object] = lambda kernel, program: None,
@@ -200,6 +201,7 @@ def compile_episodes(
         inputs_O: indices of the observations that are computed; others are always zero.
         training: training episodes, or else evaluation episodes.
         per_lane_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
+        finds_faults: see `workers.episode.episode_steps`.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
         check, check_resets: functions that raise an exception if new code is wrong; see check.py.
@@ -209,7 +211,8 @@ def compile_episodes(
         NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
-    program = write_episodes(environment, spec, inputs_O, target, training=training, per_lane_weights=per_lane_weights)
+    kind = {"training": training, "per_lane_weights": per_lane_weights, "finds_faults": finds_faults}
+    program = write_episodes(environment, spec, inputs_O, target, **kind)
     begin = compile_resets(program.steps.begin, target, folder, check_resets)
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 

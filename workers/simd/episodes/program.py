@@ -67,6 +67,7 @@ def write_episodes(
     *,
     training: bool,
     per_lane_weights: bool = False,
+    finds_faults: bool = False,
 ) -> EpisodeProgram:
     """Program of a run's episodes for a target, which need not be this processor; `compile_episodes` compiles it.
 
@@ -75,7 +76,7 @@ def write_episodes(
     """
     rank = spec.noise_rank if training else 0
     weights: Weights = "perturbed" if training and not rank else "per_lane" if per_lane_weights else "shared"
-    steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
+    steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O, finds_faults=finds_faults)
     network = plan(spec.policy, inputs_O, target)
     low_rank = plan_noise(spec.policy, rank, inputs_O, network.hidden, target.width) if rank else None
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
@@ -83,7 +84,7 @@ def write_episodes(
     carry = jax.eval_shape(steps.begin, key)
     normalised_observation, advance = (
         jax.make_jaxpr(steps.normalised_observation)(carry, inputs, inputs),
-        jax.make_jaxpr(steps.advance)(carry, inputs, outputs, key),
+        jax.make_jaxpr(steps.advance)(carry, inputs, inputs, outputs, key),
     )
     leaves = jax.tree.leaves(carry)
     if [(aval.shape, aval.dtype) for aval in advance.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:
@@ -144,7 +145,13 @@ def _module(
     sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
     observation_code = graph_function("look", graph, outputs, sources, "seen", target)
     graph, _, outputs = advance
-    sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
+    sources = [
+        ("carry", words),
+        ("constants", inputs),
+        ("seen", inputs),
+        ("action", actions),
+        ("action_key", KEY_WORDS),
+    ]
     advance_code = graph_function("move", graph, outputs, sources, "carry", target)
     policy_code = policy_function(network, weights, low_rank)
     per_lane, noisy, keeps = weights == "per_lane", weights == "perturbed" or low_rank is not None, False
@@ -187,7 +194,7 @@ def _module(
         def step(number_of_step: str, _: Values) -> Values:
             builder.do(f"call void @look(ptr {carry}, ptr {constants}, ptr {seen})")
             builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr {policies}, {given}ptr {hidden}, ptr {action})")
-            builder.do(f"call void @move(ptr {carry}, ptr {constants}, ptr {action}, ptr {action_key})")
+            builder.do(f"call void @move(ptr {carry}, ptr {constants}, ptr {seen}, ptr {action}, ptr {action_key})")
             if kept:
                 keep(number_of_step)
             return []

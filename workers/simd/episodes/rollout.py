@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
+from workers.rollouts.backend import NO_FAULT, Episodes
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.backend.words import aligned, require
@@ -88,16 +90,24 @@ def make_training_rollout(
         elsewhere: function (kernel, centre_D, arguments of `EpisodeKernel.run` after the weights) -> Episodes with the
             same bits, which is called in its place; its `compile` takes a kernel.
     """
-    kernels = _Kernels(environment, spec, training=True)
+    with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
+    kernels, finding = (_Kernels(environment, spec, training=True, finds_faults=finds) for finds in (False, True))
 
     def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
         kernel, weights = kernels.for_centre(centre_D, mean_O)
         by_episode = []
+
+        def again(lane_M: np.ndarray, *keys_L: np.ndarray) -> Episodes:
+            finder, weights = finding.for_centre(centre_D, mean_O)
+            keys_M = (keys[lane_M] for keys in keys_L)
+            return finder.run(weights, unit, mean_O, std_O, noise_keys_P[lane_M[::2] // 2], *keys_M)
+
         for episode in range(spec.episodes_per_member):
             keys = (keys_P_S_E[:, :, episode] for keys_P_S_E in (reset_keys_P_S_E, action_keys_P_S_E))
-            lanes = (keys_P_S.reshape(-1, KEY_WORDS) for keys_P_S in keys)
-            given = (unit, mean_O, std_O, noise_keys_P, *lanes)
-            by_episode.append(kernel.run(weights, *given) if elsewhere is None else elsewhere(kernel, centre_D, *given))
+            keys_L = [keys_P_S.reshape(-1, KEY_WORDS) for keys_P_S in keys]
+            given = (unit, mean_O, std_O, noise_keys_P, *keys_L)
+            episodes = kernel.run(weights, *given) if elsewhere is None else elsewhere(kernel, centre_D, *given)
+            by_episode.append(with_faults(episodes, lambda lane_M, keys_L=keys_L: again(lane_M, *keys_L), pairs=True))
         axes = (len(noise_keys_P), 2, spec.episodes_per_member)
         if len(by_episode) == 1:
             return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), by_episode[0])
@@ -114,11 +124,16 @@ def make_training_rollout(
 
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
-    kernels = _Kernels(environment, spec, training=False)
+    with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
+    kernels, finding = (_Kernels(environment, spec, training=False, finds_faults=finds) for finds in (False, True))
 
     def rollout(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
-        kernel, weights = kernels.for_centre(centre_D, mean_O)
-        return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E, wanted_E)
+        def run(kernels: _Kernels, keys_E: np.ndarray, wanted_E: np.ndarray | None = None) -> Episodes:
+            kernel, weights = kernels.for_centre(centre_D, mean_O)
+            return kernel.run(weights, 0.0, mean_O, std_O, None, keys_E, keys_E, wanted_E)
+
+        episodes = run(kernels, reset_keys_E, wanted_E)
+        return with_faults(episodes, lambda lane_M: run(finding, reset_keys_E[lane_M]), wanted_E)
 
     def compile_for(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
         kernels.fitting(mean_O).begin.compile(reset_keys_E)
@@ -129,8 +144,11 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
 def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
     lanes."""
-    kernels = _Kernels(environment, spec, training=False, per_lane_weights=True)
-
+    with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
+    kernels, finding = (
+        _Kernels(environment, spec, training=False, per_lane_weights=True, finds_faults=finds)
+        for finds in (False, True)
+    )
     make = make_variation()
 
     def rollout(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
@@ -147,7 +165,13 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
                 )
                 part[...] = parameters_N_D
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
-        return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
+
+        def run(kernel: EpisodeKernel, lane_M: Any) -> Episodes:
+            keys_M = reset_keys_L[lane_M]
+            given = mean_L_O[lane_M], std_L_O[lane_M], None, keys_M, keys_M
+            return kernel.run(addresses_N[policy_L[lane_M]], 0.0, *given)
+
+        return with_faults(run(kernel, slice(None)), lambda lane_M: run(finding.fitting(mean_L_O), lane_M))
 
     def compile_for(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernels.fitting(mean_L_O).begin.compile(reset_keys_L)
@@ -169,6 +193,51 @@ def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, per_lane
     return rollout
 
 
+def _with_faults(
+    episodes: Episodes,
+    again: Callable[[np.ndarray], Episodes],
+    wanted_L: np.ndarray | None = None,
+    *,
+    pairs: bool = False,
+    allow_infeasible: bool = False,
+) -> Episodes:
+    """Episodes [L] with `Episodes.fault`.
+
+    To look for faults would cost small policies some percent of their speed. A kernel only leaves a trace of them, a
+    result that is not finite, for other reasons too. Episodes with such a result run again.
+
+    Args:
+        again: function from lanes [M] to their episodes [M], by a kernel that finds faults.
+        wanted_L: lanes that count; None for all.
+        pairs: whether neighbouring lanes can only run together.
+        allow_infeasible: whether a fitness of -inf alone is no reason to look.
+    """
+
+    def not_finite(*arrays: np.ndarray) -> np.ndarray:
+        rows = [array.reshape(len(episodes.steps), -1) for array in arrays]
+        return ~np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows])
+
+    is_suspect_L = not_finite(episodes.fitness, episodes.returns, episodes.descriptor)
+    if allow_infeasible:
+        is_suspect_L &= episodes.fitness != -np.inf
+    is_suspect_L |= not_finite(episodes.shifted_sum_O, episodes.shifted_square_sum_O)
+    if wanted_L is not None:
+        is_suspect_L &= wanted_L
+    if pairs:
+        is_suspect_L = is_suspect_L.reshape(-1, 2).any(axis=1).repeat(2)
+    episodes = episodes._replace(fault=np.tile(np.array([0, NO_FAULT], np.int32), (len(is_suspect_L), 1)))
+    lane_M = np.flatnonzero(is_suspect_L)
+    if not lane_M.size:
+        return episodes
+
+    def put(array_L: np.ndarray, array_M: np.ndarray) -> np.ndarray:
+        array_L = array_L.copy()
+        array_L[lane_M] = array_M
+        return array_L
+
+    return jax.tree.map(put, episodes, again(lane_M))
+
+
 class _Kernels:
     """Kernels of a run: one that omits inputs that are always zero, and one with all inputs.
 
@@ -176,10 +245,18 @@ class _Kernels:
     """
 
     def __init__(
-        self, environment: Environment, spec: WorkerSpec, *, training: bool, per_lane_weights: bool = False
+        self,
+        environment: Environment,
+        spec: WorkerSpec,
+        *,
+        training: bool,
+        per_lane_weights: bool = False,
+        finds_faults: bool = False,
     ) -> None:
         self._environment, self._spec = environment, spec
-        self._training, self._per_lane_weights = training, per_lane_weights
+        self._compile = partial(
+            compile_episodes, training=training, per_lane_weights=per_lane_weights, finds_faults=finds_faults
+        )
         self._zero_O = always_zero(environment)
         if self._zero_O.all():
             self._zero_O[0] = False
@@ -199,12 +276,10 @@ class _Kernels:
             if omit_zero_inputs not in self._compiled:
                 inputs_O = np.flatnonzero(~self._zero_O) if omit_zero_inputs else np.arange(self._zero_O.size)
                 try:
-                    kernel = compile_episodes(
+                    kernel = self._compile(
                         self._environment,
                         self._spec,
                         inputs_O,
-                        training=self._training,
-                        per_lane_weights=self._per_lane_weights,
                         check=check_episodes,
                         check_resets=partial(check_resets, environment=self._spec.environment),
                     )

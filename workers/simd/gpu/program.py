@@ -92,18 +92,18 @@ def step_functions(
     environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, target: Target, *, quick: bool
 ) -> list[FunctionBuilder]:
     """Functions of the kernels `look` and `advance`, with arguments as `episode_functions` and `function_of`."""
-    steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
+    steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O, finds_faults=False)
     carry = jax.eval_shape(steps.begin, KEY)
     inputs, outputs = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (len(inputs_O), spec.policy.outputs))
     of_carry, of_constants = ("carries", carry), ("constants", inputs)
     see = function_of(
         "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
     )
-    given = [of_carry, of_constants, ("actions", outputs), ("action_keys", KEY)]
+    given = [of_carry, of_constants, ("seen", inputs), ("actions", outputs), ("action_keys", KEY)]
     move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick=quick)
     carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
     sees = Call(see[-1], ("carries", "constants", "seen"))
-    moves = Call(move[-1], ("carries", "constants", "actions", "action_keys"))
+    moves = Call(move[-1], ("carries", "constants", "seen", "actions", "action_keys"))
     of_move = [carries, constants, Pointer("actions"), Pointer("action_keys"), seen]
     return [
         *see,
