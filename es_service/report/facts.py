@@ -64,7 +64,7 @@ def _certified(data: RunData) -> str:
     success = "" if row["successes"] is None else f" and succeeds in {row['successes']:,} of them"
     tries = f" It passed in {tries_sentence(row['tries'])}." if row["tries"] else ""
     return (
-        f"The certified policy, {row['policy']}, has a mean {what} of {value} in "
+        f"The certified policy, {data.certified.title}, has a mean {what} of {value} in "
         f"{counted(row['episodes'], 'episode')} that no choice has seen{success}.{tries} "
     )
 

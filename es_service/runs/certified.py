@@ -119,6 +119,12 @@ class Certified:
         """Its parameters, and mean and standard deviation of its observations."""
         return self.parameters_D, self.observation_mean_O, self.observation_std_O
 
+    @property
+    def title(self) -> str:
+        """Its name and the generation of its policy, since another one may have the name by now: "4,18 of generation
+        120"."""
+        return self.name if self.generation is None else f"{self.name} of generation {self.generation:,}"
+
     def row(self) -> dict[str, Any]:
         """The policy as a row of a table."""
         return {
@@ -207,15 +213,17 @@ def target_reached(folder: Path, target: float | None, fitness: str) -> str:
     if report is decision:
         return f"{what}, which a version before 0.24 also quoted; certify it again for a value that decides nothing"
     below = ", below the target" if value < target else ""
-    return f"{what} (try {report.tries}), and {value:.6g} in {report.episodes.count} further certified ones{below}"
+    tries = f"try {report.tries:,} so far, with any target"
+    return f"{what} ({tries}), and {value:.6g} in {report.episodes.count} further certified ones{below}"
 
 
 def tries_sentence(tries: int) -> str:
-    """How easily a run of so many decisions ends by luck, in words."""
+    """How easily a run of so many decisions ends by luck, in words. They may have been for other targets, which are not
+    stored."""
     share = 100 * false_pass_share(tries, EPISODES, BELOW)
     which = "a policy" if tries == 1 else f"at least one of {tries:,} policies"
     lucky = f"{which} {BELOW:g} standard deviations below it would pass with {share:.1f} %"
-    return f"try {tries:,} to reach the target ({lucky})"
+    return f"try {tries:,} of the tries so far, with any target ({lucky})"
 
 
 def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:

@@ -87,7 +87,8 @@ def _cells(summary: Summary) -> list[Markup]:
         constants, row, limits = status.run.constants, status.row or {}, status.limits
         of = {key: f" of {short(limit)}" for key, limit in limits.items()}
         best = number(row["best_fitness"]) if row else ""
-        certified = "" if summary.certified_fitness is None else number(summary.certified_fitness)
+        value, policy = summary.certified_fitness, summary.certified
+        certified = "" if value is None or policy is None else f"{number(value)} ({policy.title})"
         share = row.get("coverage")
         coverage = "" if share is None else f"{100 * share:.1f} %"
         values = [

@@ -151,7 +151,7 @@ def test_a_policy_that_passes_a_lower_target_than_it_was_tried_with_is_certified
     best = float(api.open_run(folder).history["best_fitness"].iloc[-1])
     [decision] = fail_one_try(folder, best)
     outcome = api.resume(folder, {"budget.target_certified": decision.row()["return_mean"] - 1.0})
-    assert "(try 1)" in outcome.reason
+    assert "(try 1 so far, with any target)" in outcome.reason
     assert len(decided(folder)) == len(certified_policies(folder)) == 1
 
 
@@ -242,7 +242,7 @@ def test_what_0_23_selected_and_certified_decides_no_resume(tmp_path):
     [policy] = certified_policies(folder)
     assert policy.decides is False
     assert target_reached(folder, -1000, "sum") == ""
-    assert "(try 1)" in api.resume(folder).reason
+    assert "(try 1 so far, with any target)" in api.resume(folder).reason
 
 
 def test_of_several_decisions_that_reach_a_target_the_newest_counts(tmp_path):
@@ -275,7 +275,7 @@ def test_how_easily_a_run_ends_by_luck_is_said_with_the_number_of_its_tries():
     """256 episodes have a standard error of 1/16: 0.1 standard deviations are 1.6 of it, which 5.48 % exceed."""
     assert false_pass_share(1, 256, 0.1) == pytest.approx(0.0548, abs=1e-4)
     assert false_pass_share(20, 256, 0.1) == pytest.approx(1.0 - (1.0 - 0.0548) ** 20, abs=1e-3)
-    assert tries_sentence(20).startswith("try 20 to reach the target (at least one of 20 policies 0.1 standard")
+    assert tries_sentence(20).startswith("try 20 of the tries so far, with any target (at least one of 20 ")
     assert "would pass with 67.6 %" in tries_sentence(20)
 
 

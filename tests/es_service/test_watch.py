@@ -364,9 +364,11 @@ def test_the_certified_fitness_is_in_the_unit_of_the_fitness_beside_it(tmp_path,
     assert float(value) == row["last_reward_mean"]
     runs = Runs([tmp_path])
     listed = str(draw_list(runs)().sections["runs"])
-    assert f'data-head="certified">{number(row["last_reward_mean"])}<' in listed
+    shown = f"{number(row['last_reward_mean'])} (best of generation {row['generation']})"
+    assert f'data-head="certified">{shown}<' in listed
     [found] = runs.find()
     page = str(draw_run(runs, found, Reading(found))().sections["what"])
+    assert f"The certified policy, best of generation {row['generation']}, has" in page
     assert f"has a mean last reward of {number(row['last_reward_mean'])} (" in page
 
 

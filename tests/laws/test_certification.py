@@ -282,13 +282,14 @@ def test_the_command_line_certifies_and_shows_it(finished, tmp_path):
     assert row["selected_by"] == "success"
     assert row["episodes"] == 20
     status = CliRunner().invoke(app, ["status", str(folder)], catch_exceptions=False).stdout
-    assert f"certified          {row['policy']}: return {row['return_mean']:,.2f} [" in status
+    policy = f"{row['policy']} of generation {row['generation']}"
+    assert f"certified          {policy}: return {row['return_mean']:,.2f} [" in status
     assert "selected, not certified" in status
     verified = CliRunner().invoke(app, ["verify", str(folder), "--json"], catch_exceptions=False)
     assert [one["differences"] for one in json.loads(verified.stdout)["certified"]] == [[]] * 5
     es_service.write_report(folder, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert f"The certified policy, {row['policy']}, has a mean return of" in page
+    assert f"The certified policy, {policy}, has a mean return of" in page
     exported = CliRunner().invoke(app, ["export", str(folder), "--to", "csv", "--out", str(tmp_path / "out")])
     assert exported.exit_code == 0, exported.output
     assert len((tmp_path / "out" / "certified.csv").read_text().splitlines()) == 1 + 5

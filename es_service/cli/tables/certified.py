@@ -15,7 +15,7 @@ from es_service.runs.certified import Certified, tries_sentence
 def print_certified(console: Console, certified: list[Certified]) -> None:
     """Print a line for each policy of a certification."""
     for policy in certified:
-        print_line(console, f"  {policy.name:<10} {certified_line(policy.row())}")
+        print_line(console, f"  {policy.title}: {certified_line(policy.row())}")
 
 
 def certified_line(row: Mapping[str, Any]) -> str:

@@ -165,7 +165,7 @@ def _certified(run: Run) -> dict[str, str]:
         policy = newest_certified(run.folder)
     except StoreError as error:
         return {"certified": f"not known: {error.sentence}"}
-    return {} if policy is None else {"certified": f"{policy.name}: {certified_line(policy.row())}"}
+    return {} if policy is None else {"certified": f"{policy.title}: {certified_line(policy.row())}"}
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:
