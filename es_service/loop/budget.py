@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from es_service.config.model import BudgetConfig
+from es_service.errors import counted
 
 REACHED = {
     "generations": "generation",
@@ -19,10 +20,10 @@ MOST_DURATIONS = 5
 """Newest generations by whose durations a run judges whether another one can end within `wall_clock_s`."""
 PHASES = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
 """Columns of the history whose sum is the duration of a generation."""
-_REASONS = {
-    "generations": "the budget of {:,} generations is spent",
-    "env_steps": "the budget of {:,} environment steps is spent",
-    "target_fitness": "the target fitness {:g} is reached",
+_REASONS: Mapping[str, Callable[[float], str]] = {
+    "generations": lambda limit: f"the budget of {counted(int(limit), 'generation')} is spent",
+    "env_steps": lambda limit: f"the budget of {counted(int(limit), 'environment step')} is spent",
+    "target_fitness": lambda limit: f"the target fitness {limit:g} is reached",
 }
 
 
@@ -50,7 +51,7 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequenc
         recent: `durations` of the newest generations, at most MOST_DURATIONS.
     """
     reached = _reached(limits, row)
-    reasons = {key: _REASONS[key].format(limits[key]) for key in reached if key in _REASONS}
+    reasons = {key: _REASONS[key](limits[key]) for key in reached if key in _REASONS}
     if (limit := limits.get("wall_clock_s")) is not None:
         seconds, least = row["wall_clock_s"], min(recent) if len(recent) > 1 else 0.0
         budget, over = f"the budget of {limit:g} s", f", exceeded by {seconds - limit:.1f} s"

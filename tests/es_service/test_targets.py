@@ -158,7 +158,7 @@ def test_a_policy_that_passes_a_lower_target_than_it_was_tried_with_is_certified
 def fail_one_try(folder, best):
     """The decision of a run whose target is the fitness of its best centre, which it does not reach."""
     outcome = api.resume(folder, {"budget.target_certified": best})
-    assert outcome.reason == "the budget of 1 generations is spent"
+    assert outcome.reason == "the budget of 1 generation is spent"
     return decided(folder)
 
 
@@ -198,7 +198,7 @@ def test_a_policy_that_was_selected_by_something_else_reaches_the_target_by_its_
     run = api.run(config, tmp_path / "run").run
     [policy] = certify_run(run.folder, by=by)
     assert policy.row()["return_mean"] < -1, "while goal distances are above it"
-    assert run_status.state(run_status.read_status(run)).startswith("finished: the budget of 1 generations")
+    assert run_status.state(run_status.read_status(run)).startswith("finished: the budget of 1 generation")
 
 
 @pytest.mark.parametrize("episodes", [16, 256])
