@@ -59,7 +59,7 @@ class Token:
 
 @dataclass(frozen=True)
 class Asked:
-    """Episodes that the caller is to compute, one for each row. It can be pickled."""
+    """Episodes that the caller is to compute, one for each row. It can be pickled. Its arrays cannot be written."""
 
     token: Token
     """What their results are told by."""
@@ -235,6 +235,8 @@ class _CallersEpisodes:
             return gradients(self._spec, work)
         rows, between = rows_of(self._spec, work), self._between
         shown = rows.parameters_N_D, rows.mean_N_O, rows.std_N_O, rows.seed_N, rows.is_noisy_N
+        for array in shown:
+            array.setflags(write=False)  # `ask` returns the same ones again
         token, generation = self._next, work[0][1].generation
         if generation != token.generation:
             token = replace(token, generation=generation, request=0)

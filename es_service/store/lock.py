@@ -171,9 +171,12 @@ def _content(text: bytes) -> dict[str, Any]:
 def _locked(folder: Path) -> RunLockedError:
     holder = lock_holder(folder) or {}
     pid, host, since = (holder.get(key) or "(unknown)" for key in ("pid", "host", "since"))
+    if (pid, host) == (os.getpid(), socket.gethostname()):
+        end = "that is this process itself: leave its block of `ask_tell`, or wait until its call that writes ends"
+    else:
+        end = "stop that process first, or wait until it ends"
     return RunLockedError(
-        f"{folder} is being written by process {pid} on host {host} since {since}; stop that process first, or wait "
-        "until it ends.",
+        f"{folder} is being written by process {pid} on host {host} since {since}; {end}.",
         run=folder,
         ways_out=[WayOut("watch", "watch it", str(folder))],
     )

@@ -227,6 +227,9 @@ def test_a_wrong_argument_is_named_and_the_next_call_works(arguments, field, tmp
         asked = search.ask()
         assert asked is not None
         assert len(asked) == 2
+        for array in (asked.parameters, asked.observation_mean, asked.observation_std, asked.seed, asked.trains):
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0
         search.tell(asked, *told_of(asked))
         assert search.run.generation == 0
 

@@ -23,6 +23,8 @@ def test_a_second_writer_is_told_who_writes_and_how_to_watch(tmp_path):
         ) as info:
             RunStore.open(folder)
         assert info.value.way_out == WayOut("watch", "watch it", str(folder))
+        assert "; that is this process itself: leave its block of `ask_tell`, or wait" in str(info.value)
+        assert "stop that process" not in str(info.value)
         store.commit(1, {}, dict.fromkeys(("env_steps", "centre_fitness_mean", "goal_distance", "seconds_rollout"), 1))
     RunStore.open(folder).close()
 
@@ -115,6 +117,8 @@ def test_a_forked_child_that_outlives_the_writer_does_not_hold_the_lock(tmp_path
         child = int(writer.stdout.readline())
         try:
             assert lock_holder(tmp_path)["pid"] == writer.pid
+            with pytest.raises(RunLockedError, match="; stop that process first, or wait until it ends"):
+                acquire_lock(tmp_path)
             writer.kill()
             writer.wait()
             os.kill(child, 0)
