@@ -52,7 +52,7 @@ def verify(
             print_line(console, f"{kind} {policy.number}, {policy.name}: {what}{since}")
     why = ""
     if any(group.differences for group in groups) or any(differences for _, differences in certified):
-        why = why_not_repeatable(run, changed_config(run.present_config, {}))
+        why = why_not_repeatable(run, changed_config(run.present_config, name=str(run.config_file)))
     equal = not any(group.differences for group in groups) and not any(differences for _, differences in certified)
     if as_json:
         print_json(

@@ -69,6 +69,7 @@ def load_config(
     rollouts: Rollouts,
     new: bool = True,
     searches: bool = True,
+    name: str = "config",
 ) -> RunConfig:
     """Load the config of a new run.
 
@@ -82,12 +83,13 @@ def load_config(
         rollouts: the rollouts that `compute.rollout` may name.
         new: whether the run that `search.init_from` names, if any, must exist.
         searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
+        name: what an error calls a `source` that is no file.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
     defaults = {} if searches else {"search.algorithm": next(iter(algorithms)), "budget.generations": 1}
-    return _load(source, overrides, tasks, algorithms, rollouts, defaults, new=new, resolved=False)
+    return _load(source, overrides, tasks, algorithms, rollouts, defaults, name, new=new, resolved=False)
 
 
 def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
@@ -138,6 +140,7 @@ def changed_config(
     tasks: Mapping[str, TaskSpec],
     algorithms: Methods,
     rollouts: Rollouts,
+    name: str = "config",
 ) -> RunConfig:
     """The config of an existing run with some keys changed.
 
@@ -148,7 +151,7 @@ def changed_config(
     Raises:
         ConfigError: as for `load_config`.
     """
-    return _load(source, overrides, tasks, algorithms, rollouts, {}, new=False, resolved=True)
+    return _load(source, overrides, tasks, algorithms, rollouts, {}, name, new=False, resolved=True)
 
 
 def _load(
@@ -158,12 +161,13 @@ def _load(
     algorithms: Methods,
     rollouts: Rollouts,
     defaults: Mapping[str, Any],
+    name: str,
     *,
     new: bool,
     resolved: bool,
 ) -> RunConfig:
     if isinstance(source, Mapping):
-        name, mapping = "config", source
+        mapping = source
     else:
         name = os.fspath(source)
         mapping = read_config(name)

@@ -20,30 +20,45 @@ from es_service.protocol.options import defaults_of
 from es_service.search.algorithms import ALGORITHMS
 
 
-def load_config(source: Source, overrides: Overrides = (), *, new: bool = True, searches: bool = True) -> RunConfig:
+def load_config(
+    source: Source, overrides: Overrides = (), *, new: bool = True, searches: bool = True, name: str = "config"
+) -> RunConfig:
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
 
     Args:
         new: whether a run is about to start with it on this machine; the folder of `search.init_from` must then exist.
         searches: whether a search uses it; if none does, `search.algorithm` and the budget may be left out.
+        name: what an error calls a `source` that is no file.
 
     Raises:
         ConfigError: lists every problem found.
     """
     return accepted(
         loading.load_config(
-            source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS, new=new, searches=searches
+            source,
+            overrides,
+            tasks=TASKS,
+            algorithms=ALGORITHMS,
+            rollouts=ROLLOUTS,
+            new=new,
+            searches=searches,
+            name=name,
         )
     )
 
 
-def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
+def changed_config(source: Source, overrides: Overrides = (), *, name: str = "config") -> RunConfig:
     """The config of a run that exists, with some keys changed; see `loading.changed_config`.
+
+    Args:
+        name: what an error calls a `source` that is no file.
 
     Raises:
         ConfigError: lists every problem found.
     """
-    return accepted(loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS))
+    return accepted(
+        loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS, name=name)
+    )
 
 
 def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[str, Any, Any]]:

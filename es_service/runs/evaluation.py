@@ -164,7 +164,7 @@ def evaluation_config(run: Run, workers: int | None = None) -> RunConfig:
     Raises ConfigError if these are too many for its cores, or if the run's own config cannot be read.
     """
     stored = run.present_config
-    config = changed_config(stored, on_this_machine(stored, workers))
+    config = changed_config(stored, on_this_machine(stored, workers), name=str(run.config_file))
     require_cores(config)
     return config
 

@@ -81,7 +81,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
         )
     present = origin.present_config
     mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
-    config = changed_config(mapping, overrides)
+    config = changed_config(mapping, overrides, name=str(origin.config_file))
     changes = changes_from(origin.constants, config)
     problems = [
         _problem_of(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new, ALGORITHMS)

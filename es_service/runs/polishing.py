@@ -46,7 +46,7 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
     overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
     is_limited = any(parse_overrides(overrides)[0].get(f"budget.{name}") is not None for name in LIMITS)
     budget = {} if is_limited else {"env_steps": steps}
-    return load_config({**sections, "search": search, "budget": budget}, overrides)
+    return load_config({**sections, "search": search, "budget": budget}, overrides, name=str(run.config_file))
 
 
 def certified_for(

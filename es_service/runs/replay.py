@@ -96,7 +96,7 @@ def record(
             ConfigError: the task cannot be used on this machine. EvaluationError: the recording failed.
     """
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], GPU: 0, "compute.workers": "auto"}
-    config = changed_config(run.present_config, overrides)
+    config = changed_config(run.present_config, overrides, name=str(run.config_file))
     chosen = candidates(run, best=best, centre=False, cells=cells, every=False)
     now = {**platform_info(), CODE: code_of(config)}
     stored = [_stored(run, candidate, now) for candidate in chosen]

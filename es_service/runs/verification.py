@@ -70,7 +70,7 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
 
 def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recomputed]:
     stored = run.present_config
-    config = changed_config(stored, on_this_machine(stored, workers))
+    config = changed_config(stored, on_this_machine(stored, workers), name=str(run.config_file))
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
     plan = _plan(run, generations)
     search = driver.Search(

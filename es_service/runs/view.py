@@ -58,6 +58,11 @@ class Run:
         return self.meta.config
 
     @property
+    def config_file(self) -> Path:
+        """The folder's `config.yaml`, which errors of `present_config` name."""
+        return self.folder / CONFIG
+
+    @property
     def present_config(self) -> dict[str, Any]:
         """`config` with the budget, engine, workers, time limits and kept states that were set last, as `resume` would
         use them.
@@ -65,10 +70,9 @@ class Run:
         Other edits of the folder's `config.yaml` are ignored here; `resume` refuses them. Raises ConfigError if that
         file cannot be read.
         """
-        file = self.folder / CONFIG
-        if not file.exists():
+        if not self.config_file.exists():
             return self.config
-        recorded = read_yaml_file(file)
+        recorded = read_yaml_file(self.config_file)
         budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
         store = recorded.get("store", self.config.get("store", {}))  # runs of older versions have no such section
         if isinstance(compute, Mapping):

@@ -12,9 +12,9 @@ import typer
 from es_service import api
 from es_service.cli import verify as command
 from es_service.config.model import worker_spec
-from es_service.errors import NotInRunError, RunLockedError
+from es_service.errors import ConfigError, NotInRunError, RunLockedError
 from es_service.protocol.messages import EpisodesResult, GradientResult
-from es_service.runs import session, verification
+from es_service.runs import evaluation, session, verification
 from es_service.runs.verification import verify
 from es_service.store.lock import acquire_lock
 from tests.helpers import DirectEvaluator
@@ -172,6 +172,25 @@ def test_a_run_that_is_being_written_cannot_be_verified_now(tmp_path, capsys):
     assert printed.out == ""
     assert "is being written by process" in printed.err
     assert len(list(verify(run))) == 2
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda run: list(verify(run)),
+        evaluation.evaluation_config,
+        lambda run: api.fork(run.folder, out=run.folder.with_name("fork")),
+        lambda run: api.resume(run.folder),
+    ],
+    ids=["verify", "evaluate", "fork", "resume"],
+)
+def test_whoever_uses_the_config_of_a_run_names_its_file_if_it_is_wrong(tmp_path, use):
+    run = computed(tmp_path / "run", "budget.generations=1")
+    file = run.folder / "config.yaml"
+    file.write_text(file.read_text().replace("generations: 1", "generations: -1"))
+    with pytest.raises(ConfigError, match=r"budget\.generations: -1 ") as caught:
+        use(run)
+    assert caught.value.sentence.startswith(f"{file}: 1 problem\n")
 
 
 @pytest.mark.parametrize("as_json", [False, True])
