@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from threading import RLock
 from typing import Any, Literal, NoReturn
 
@@ -98,13 +99,16 @@ class PolicyEvaluations:
 class PolicyEvaluator:
     """Callable that evaluates policies; `evaluator` makes one. Calls from several threads wait for each other."""
 
-    def __init__(self, config: RunConfig, task: TaskSpec, engine: Engine[Any]) -> None:
+    def __init__(self, config: RunConfig, task: TaskSpec, start: Callable[[], Engine[Any]]) -> None:
         self.config = config
         self.task = task
         """The task, with `descriptor_names` and `descriptor_bounds`."""
         self.parameters = policy_spec(config, self.task).parameters
         """Number of parameters of a policy, D."""
-        self._engine = engine
+        self._start = start
+        self._engine = start()
+        self._has_engine = True
+        """False after an error of the rollouts, until the next call starts another one."""
         self._closed = ""
         self._maker = os.getpid()
         self._in_turn = RLock()  # an error during a call closes the evaluator in its turn
@@ -139,7 +143,8 @@ class PolicyEvaluator:
 
         Raises:
             ConfigError: an argument is wrong; `field` names it.
-            EvaluationError: the rollouts cannot continue, after which the evaluator is closed; or it is closed.
+            EvaluationError: the rollouts cannot continue, such as after an error in the code of the task, and the
+                workers have ended; the next call starts others. Or the evaluator is closed.
             ForkedError: this process was forked from the one that made the evaluator.
         """
         policies_N_D = policies_of(self.config, self.task, parameters)
@@ -155,9 +160,15 @@ class PolicyEvaluator:
         with self._in_turn:
             if self._closed:
                 raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
+            if not self._has_engine:
+                self._engine, self._has_engine = self._start(), True
             try:
                 answers = self._engine.evaluate(asked.work)
-            except BaseException as error:  # also an interrupt: the engine may have stopped at any point
+            except Exception:  # the engine may have stopped at any point
+                self._has_engine = False
+                self._engine.close()
+                raise
+            except BaseException as error:  # an interrupt ends whatever uses the evaluator
                 self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
                 raise
         result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
@@ -179,7 +190,8 @@ class PolicyEvaluator:
         with self._in_turn:
             if not self._closed:
                 self._closed = why
-                self._engine.close()
+                if self._has_engine:
+                    self._engine.close()
 
 
 class Evaluating(AbstractContextManager[PolicyEvaluator]):
@@ -290,8 +302,10 @@ def _started(
     config = evaluating_config(config, workers, engine, address)
     task = task_of(config)  # before the workers start, since it may raise
     outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
-    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs)
-    return PolicyEvaluator(config, task, started)
+    start = partial(
+        make_engine, config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs
+    )
+    return PolicyEvaluator(config, task, start)
 
 
 def evaluating_config(

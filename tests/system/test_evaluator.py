@@ -286,6 +286,28 @@ def test_a_closed_evaluator_and_one_that_was_interrupted_say_so(monkeypatch):
             evaluate(POLICIES[:1])
 
 
+def test_after_an_error_of_user_code_the_next_call_starts_other_workers():
+    config = {
+        "task": {"environment": "python:tests.workers.host_tasks:Narrow"},
+        "policy": {"hidden": []},
+        "compute": {"engine": "inline", "workers": 1},
+    }
+    before = children()
+    with es_service.evaluator(config) as evaluate:
+        good = np.zeros((1, evaluate.parameters))
+        first = evaluate(good).fitness.tobytes()
+        for _ in range(2):
+            with pytest.raises(EvaluationError, match="the action is too large"):
+                evaluate(good + 1.0)
+            assert children() == before
+        assert evaluate(good).fitness.tobytes() == first
+        with pytest.raises(EvaluationError, match="the action is too large"):
+            evaluate(good + 1.0)
+    assert children() == before
+    with pytest.raises(EvaluationError, match="this evaluator is closed"):
+        evaluate(good)
+
+
 def test_closing_waits_for_the_call_of_another_thread(monkeypatch):
     send, begun, free = ChildProcesses.send, Event(), Event()
 

@@ -122,6 +122,15 @@ class Fragile(Drift):
         return super().step(action)
 
 
+class Narrow(Drift):
+    """A drift that refuses actions above 0.5."""
+
+    def step(self, action):
+        if action[0] > 0.5:
+            raise ValueError("the action is too large")
+        return super().step(action)
+
+
 class Undefined(Drift):
     """A drift whose fifth reward is no number, where the place is below 0."""
 
