@@ -21,6 +21,7 @@ from es_service.report.data import RunData
 from es_service.report.series import Chart, Line
 
 POINTS = 200
+"""Equally spaced points of a curve; the ends of each group are points, too."""
 AXES = ("env_steps", "wall_clock_s")
 """History columns that groups are compared against."""
 COLUMNS = {
@@ -158,8 +159,7 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
     A curve ends where the first run of its group ends, so that every point is over all of its runs. It is empty if that
     is before another run begins; so every axis has the same charts.
     """
-    last = max(float(np.nanmax(run.history[axis])) for group in groups for run in group.runs)
-    x_K = np.linspace(0.0, last, POINTS)
+    x_K = places(groups, axis)
     chart_list = []
     for column, (title, note, percent) in COLUMNS.items():
         runs = [run for group in groups for run in group.runs]
@@ -175,6 +175,20 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             lines.append(Line(group.name, np.median(y_R_K, axis=0), range_K))
         chart_list.append(Chart(title, note, tuple(lines), None, percent))
     return chart_list, x_K
+
+
+def places(groups: Sequence[Group], axis: str) -> NDArray[np.float64]:
+    """Places of the points of curves on a history column [K]: equally spaced ones from 0 to the end of the longest run,
+    and the first and the last place at which all runs of a group have values, so that no curve loses its ends."""
+    ends = [
+        (
+            max(float(np.nanmin(run.history[axis])) for run in group.runs),
+            min(float(np.nanmax(run.history[axis])) for run in group.runs),
+        )
+        for group in groups
+    ]
+    last = max(float(np.nanmax(run.history[axis])) for group in groups for run in group.runs)
+    return np.unique([*np.linspace(0.0, last, POINTS), *np.ravel(ends)])
 
 
 def values_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from es_service.report.facts import number
 from es_service.report.markup import Frame, Markup, joined, spread, table, tag, tick_text, ticks
-from es_service.report.series import X_AXES, Chart
+from es_service.report.series import X_AXES, Chart, lone
 
 WIDTH, HEIGHT = 560, 250
 STYLES = 7
 """Number of styles of curves in the stylesheet; more curves use them again."""
+DOT_RADIUS = 3
+"""In pixels; of a point without neighbours, which no line shows."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 10, 40
 
 
@@ -56,10 +58,14 @@ def draw(chart_on: Mapping[str, tuple[Chart, NDArray[np.float64]]]) -> tuple[Mar
             if line.range_K is not None:
                 low_K, high_K = (scale * values for values in line.range_K)
                 content.append(tag("path", d=area(frame, x_K, low_K, high_K), class_=f"fill range s{index % STYLES}"))
-        content += [
-            tag("path", d=line_path(frame, x_K, scale * line.y_K), class_=f"line s{index % STYLES}")
-            for index, line in enumerate(chart.lines)
-        ]
+        for index, line in enumerate(chart.lines):
+            y_K, style = scale * line.y_K, f"s{index % STYLES}"
+            lone_K = lone(x_K, y_K)
+            content.append(tag("path", d=line_path(frame, x_K, y_K), class_=f"line {style}"))
+            content += [
+                tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=DOT_RADIUS, class_=f"fill {style}")
+                for x, y in zip(frame.across(x_K[lone_K]), frame.down(y_K[lone_K]), strict=True)
+            ]
         content.append(tag("line", class_="pointer", y1=_TOP, y2=HEIGHT - _BOTTOM))
         box, name = f"0 0 {WIDTH} {HEIGHT}", f"{chart.title} against {label}"
         figures.append(tag("svg", *content, viewBox=box, role="img", aria_label=name, class_=f"x x-{column}"))
@@ -129,14 +135,14 @@ def _step(values: list[float]) -> float:
 
 
 def line_path(frame: Frame, x_K: NDArray[np.float64], y_K: NDArray[np.float64]) -> str:
-    """Path through points, with gaps where a value is missing; a point between two gaps is drawn as a dot."""
+    """Path through points, with gaps where a value is missing; see `series.lone` for points between two gaps."""
     across, down = frame.across(x_K), frame.down(y_K)
     commands, drawing = [], False
     for x, y in zip(across, down, strict=True):
         if not (np.isfinite(x) and np.isfinite(y)):
             drawing = False
             continue
-        commands.append(f"L{x:.1f} {y:.1f}" if drawing else f"M{x:.1f} {y:.1f}h0")
+        commands.append(f"L{x:.1f} {y:.1f}" if drawing else f"M{x:.1f} {y:.1f}")
         drawing = True
     return "".join(commands)
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.system import given_path
@@ -22,7 +23,7 @@ from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
 from es_service.report.detours import detours
 from es_service.report.floor import beside_walls, is_plan
-from es_service.report.series import X_AXES
+from es_service.report.series import X_AXES, lone
 from es_service.runs.view import Run
 from es_service.search.maps.geometry import Grid, intervals
 
@@ -167,15 +168,14 @@ def curves(
         if name not in allowed or any(column not in data.history for data in all_data):
             raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
     groups = compare.grouped(all_data, group_by)
-    last = max(float(run.history[against][-1]) for run in all_data)
-    x_K = np.linspace(0.0, last, compare.POINTS)
+    x_K = compare.places(groups, against)
     for index, group in enumerate(groups):
         style = {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
         if len(all_data) == 1:
-            axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
+            _curve(axes, group.runs[0].history[against], group.runs[0].history[column], style)
             continue
         y_R_K = compare.values_at(group, column, against, x_K)
-        axes.plot(x_K, np.median(y_R_K, axis=0), label=group.name, **style)
+        _curve(axes, x_K, np.median(y_R_K, axis=0), style | {"label": group.name})
         if (interval_2_K := group.interval(y_R_K)) is not None:
             axes.fill_between(x_K, *interval_2_K, color=style["color"], alpha=0.18, linewidth=0)
     axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))
@@ -185,6 +185,13 @@ def curves(
     if len(groups) > 1:
         for text in axes.legend(frameon=False).get_texts():
             text.set_parse_math(False)
+
+
+def _curve(axes: Axes, x_K: NDArray[np.float64], y_K: NDArray[np.float64], style: dict[str, Any]) -> None:
+    """A line through points, with a dot for each that has no neighbour."""
+    [line] = axes.plot(x_K, y_K, **style)
+    if (lone_K := lone(x_K, y_K)).any():
+        line.set(marker="o", markersize=4, markevery=np.flatnonzero(lone_K).tolist())
 
 
 def _data(run: Source) -> RunData:

@@ -242,3 +242,9 @@ def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Gro
     with np.errstate(invalid="ignore"):
         sums_K = np.add.reduceat(np.where(finite_G, values_G, 0.0), starts_K)
         return sums_K / np.where(counts := np.add.reduceat(finite_G.astype(float), starts_K), counts, np.nan)
+
+
+def lone(x_K: NDArray[np.float64], y_K: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a point of a curve is there and its neighbours are not, so that no line leads to it, [K]."""
+    there_K = np.pad(np.isfinite(x_K) & np.isfinite(y_K), 1)
+    return there_K[1:-1] & ~there_K[:-2] & ~there_K[2:]

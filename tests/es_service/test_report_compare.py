@@ -91,6 +91,51 @@ def test_curves_are_medians_of_all_runs_of_a_group_and_end_with_the_first(runs):
     assert np.isfinite(line.y_K[(x_K >= 1000) & (x_K <= 21_000)]).all()
 
 
+def cut(run, generations):
+    """The same run, ended earlier."""
+    return replace(run, history={name: values_G[:generations] for name, values_G in run.history.items()})
+
+
+def test_the_ends_of_a_short_run_are_points_of_its_curve(runs, axes):
+    """It breaks through in its last generation, at 2,700 steps. The grid of the long one, which has 39,800 steps, has
+    200 steps between its points, and the short one ends between two of them."""
+
+    def at_steps(run, steps_G):
+        columns = {"env_steps": steps_G, "wall_clock_s": steps_G / 2}
+        return replace(run, history={**run.history, **columns})
+
+    short = at_steps(cut(runs[3], 3), np.array([700.0, 1700.0, 2700.0]))
+    short = replace(short, history={**short.history, "best_fitness": np.array([1.0, 2.0, 9.0])})
+    long = at_steps(runs[0], np.linspace(1000, 39_800, 21))
+    groups = compare.grouped([long, short])
+    for axis, scale in (("env_steps", 1.0), ("wall_clock_s", 0.5)):
+        charts, x_K = compare.charts(groups, axis)
+        y_K = charts[0].lines[1].y_K
+        there_K = np.isfinite(y_K)
+        np.testing.assert_array_equal(x_K[there_K][[0, 1, -1]], np.array([700.0, 800.0, 2700.0]) * scale)
+        np.testing.assert_array_equal(y_K[there_K][[0, 1, -2, -1]], [1.0, 1.0, 2.0, 9.0])
+        axes.clear()
+        plots.curves([long, short], axes, against=axis)
+        assert [9.0, 2700.0 * scale] == [np.nanmax(axes.lines[1].get_ydata()), axes.lines[1].get_xdata()[y_K == 9.0]]
+
+
+def test_the_ends_of_a_group_are_where_all_of_its_runs_have_values(runs):
+    runs_2 = [replace(cut(run, 2), history={**cut(run, 2).history, "env_steps": np.array(steps)})
+              for run, steps in zip(runs[:2], ([10.0, 30.0], [20.0, 40.0]), strict=True)]  # fmt: skip
+    x_K = compare.places(compare.grouped([*runs_2, runs[3]]), "env_steps")  # a grid of 21,000 / 199 steps
+    np.testing.assert_array_equal(x_K[:4], [0.0, 20.0, 30.0, 21_000 / 199])
+
+
+def test_a_curve_of_one_point_is_a_dot(runs, axes):
+    alone = cut(runs[3], 1)
+    page = Elements(comparison_page([runs[0], alone]))
+    assert ("class", "fill s1") in page.attributes
+    plots.curves([runs[0], alone], axes)
+    assert [line.get_marker() for line in axes.lines] == ["None", "o"]
+    [at] = axes.lines[1].get_markevery()
+    assert axes.lines[1].get_xydata()[at].tolist() == [1000.0, alone.history["best_fitness"][0]]
+
+
 def test_runs_that_begin_after_others_have_ended_are_compared_on_both_axes(runs):
     """Short runs on a busy machine: the first generation of one took longer than all of another."""
     late = replace(runs[1], history={**runs[1].history, "wall_clock_s": runs[1].history["wall_clock_s"] + 1e6})
