@@ -52,6 +52,10 @@ def main(name: str, settings: str = "{}") -> None:
         if task.kind == "python":
             options = option_values(task.options, given.get("options", {}))
             task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options))
+        elif task.kind == "jax" and not name.startswith("brax:"):
+            from workers.traces import require_pure
+
+            require_pure(task, option_values(task.options, given.get("options", {})))
         answer = {"task": dataclasses.asdict(task)}
     except TaskError as error:
         answer = {"problem": str(error)}
