@@ -176,6 +176,12 @@ def evaluated_word(row: Row) -> str:
     return "centre" if moved or row["generation"] == 0 else "policy"
 
 
+def evaluated_nouns(row: Row) -> tuple[str, str]:
+    """`evaluated_word`, in the singular and in the plural."""
+    word = evaluated_word(row)
+    return word, "policies" if word == "policy" else f"{word}s"
+
+
 @dataclass(frozen=True)
 class Resets:
     """Address of the resets of an evaluation's episodes; see `protocol.noise.evaluation_reset_keys`."""

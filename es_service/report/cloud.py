@@ -1,4 +1,4 @@
-"""All evaluated centres as a cloud of points, with a slider over the generations.
+"""All evaluated centres, or policies, as a cloud of points, with a slider over the generations.
 
 The points are drawn by the page on a canvas, because there may be many; their places and colours are computed here.
 """
@@ -22,13 +22,13 @@ STOPS = 200
 
 
 def cloud(data: RunData) -> tuple[Markup, dict[str, Any], tuple[float, float], str] | None:
-    """The cloud of a run; None if no valid centre was evaluated.
+    """The cloud of a run; None if no evaluation was valid.
 
     Returns:
         figure; what its script needs: `x`, `y` in tenths of a pixel and `level` (index in `colours`) in base64, and in
         `stops` [points shown, text] of each place of the slider; fitness of the first and last colour; explanation.
     """
-    names = data.names
+    names, nouns = data.names, data.evaluated
     place_N_B = np.stack([data.centres[name] for name in names], axis=1)
     fitness_N, generation_N = data.centres["fitness_mean"], data.centres["generation"]
     fine_N = np.isfinite(place_N_B).all(axis=1) & np.isfinite(fitness_N)
@@ -53,7 +53,7 @@ def cloud(data: RunData) -> tuple[Markup, dict[str, Any], tuple[float, float], s
     box = f"0 0 {width:.0f} {height:.0f}"
     figure = tag(
         "div",
-        tag("svg", floor.ground(frame, labels), viewBox=box, role="img", aria_label="Evaluated centres"),
+        tag("svg", floor.ground(frame, labels), viewBox=box, role="img", aria_label=f"Evaluated {nouns[1]}"),
         tag("canvas", width=2 * round(width), height=2 * round(height), id="cloud"),
         tag("svg", walls, viewBox=box, class_="above"),
         class_="layers",
@@ -66,11 +66,11 @@ def cloud(data: RunData) -> tuple[Markup, dict[str, Any], tuple[float, float], s
         "level": packed(level(fitness_N, *colours), "int8"),
         "colours": SCALE,
         "stops": [
-            [count, f"generation {end:,}: {counted(count, 'centre')}, best {number(best)}"]
+            [count, f"generation {end:,}: {counted(count, *nouns)}, best {number(best)}"]
             for end, count, best in zip(ends.tolist(), counts, _best_until(fitness_N, counts), strict=True)
         ],
     }
-    which = "Each point is an evaluated centre, at its mean descriptor"
+    which = f"Each point is an evaluated {nouns[0]}, at its mean descriptor"
     more = f"; {len(kept):,} of {valid:,} are shown, at equal distances" if valid > len(kept) else ""
     also = f", in the first two of {len(names)} dimensions" if len(names) > 2 else ""
     return figure, points, colours, f"{which}{also}; the colour is its fitness{more}."

@@ -25,8 +25,12 @@ POINTS = 200
 AXES = ("env_steps", "wall_clock_s")
 """History columns that groups are compared against."""
 COLUMNS = {
-    "best_fitness": ("Best fitness so far", "Highest mean fitness of an evaluated centre.", False),
-    "goal_distance": ("Distance to the goal", "Mean over the evaluation episodes of the newest centre.", False),
+    "best_fitness": ("Best fitness so far", "Highest mean fitness of an evaluated centre or policy.", False),
+    "goal_distance": (
+        "Distance to the goal",
+        "Mean over the evaluation episodes of the newest centre or policy.",
+        False,
+    ),
     "coverage": ("Coverage of the behaviour map", "Filled cells as a share of all cells.", True),
     "qd_score": (
         "QD-score",

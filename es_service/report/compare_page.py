@@ -188,6 +188,8 @@ def _maps(groups: Sequence[Group]) -> list[Markup]:
     if not shown:
         return []
     colours = value_range(np.concatenate([run.map.fitness_N for _, run in shown if run.map is not None]))
+    even = any(len(group.runs) % 2 == 0 for group, _ in shown)
+    lower = " (of an even number of runs, the lower of the two in the middle)" if even else ""
     figures = []
     for group, run in shown:
         figure, _, _ = maps.draw_map(run, colours)
@@ -198,7 +200,7 @@ def _maps(groups: Sequence[Group]) -> list[Markup]:
             "Behaviour maps",
             tag(
                 "p",
-                "Of the run of each group whose best fitness is the median; all have the same colours.",
+                f"Of the run of each group whose best fitness is the median{lower}; all have the same colours.",
                 class_="note",
             ),
             tag("div", *figures, class_="side"),

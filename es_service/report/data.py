@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
 from es_service.loop.forms import problem
+from es_service.loop.history import evaluated_nouns
 from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
@@ -94,6 +95,11 @@ class RunData:
         """Newest value of a history column; NaN if there is none."""
         values = self.history.get(column)
         return float(values[-1]) if values is not None and values.size else float("nan")
+
+    @property
+    def evaluated(self) -> tuple[str, str]:
+        """What the newest generation has evaluated, centres or policies, in the singular and in the plural."""
+        return evaluated_nouns({name: self.last(name) for name in ("generation", "update_norm")})
 
     def cell_name(self, cell: int) -> str:
         """A cell as users write it: its place along each dimension, such as 3,17, or its number in a cvt map."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from es_service.errors import counted
-from es_service.loop.history import evaluated_word
 from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
@@ -38,8 +37,7 @@ def verdict(data: RunData) -> str:
     # A run of generation 0 alone has evaluated random weights and has not searched.
     alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
     episodes = data.constants["search.evaluation_episodes"]
-    word = evaluated_word({name: data.last(name) for name in ("generation", "update_norm")})
-    clause = f"The best {word}, found {where}, has a mean fitness of {number(fitness)}"
+    clause = f"The best {data.evaluated[0]}, found {where}, has a mean fitness of {number(fitness)}"
     sentence = f"{alone}{clause} over {counted(episodes, 'evaluation episode')} (selected, not certified)"
     target = data.status.limits.get("target_fitness")
     if target is not None:

@@ -186,14 +186,14 @@ def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> M
 
 
 def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
-    drawn = cloud(data)
+    drawn, (word, words) = cloud(data), data.evaluated
     if drawn is None:
-        return section("Evaluated centres", tag("p", "No valid centre was evaluated."), id_="centres")
+        return section(f"Evaluated {words}", tag("p", f"No valid {word} was evaluated."), id_="centres")
     figure, scripts["cloud"], colours, explanation = drawn
     last = len(scripts["cloud"]["stops"]) - 1
     slider = Markup(f'<input type="range" id="until" min="0" max="{last}" value="{last}" aria-label="generation">')
     return section(
-        "Evaluated centres",
+        f"Evaluated {words}",
         tag("p", explanation, class_="note"),
         tag(
             "div",
@@ -211,7 +211,7 @@ def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
 
 
 def _parameters(data: RunData) -> Markup:
-    """The parameters of the best centre, if the task is a function of them."""
+    """The parameters of the best centre or policy, if the task is a function of them."""
     spec = data.task.parameters
     if spec is None or not data.best_parameters:
         return Markup()
@@ -220,7 +220,7 @@ def _parameters(data: RunData) -> Markup:
         bounds = "none" if (low, high) == FREE else f"{low:g} to {high:g}"
         rows.append((name, f"{value:.9g}", bounds, f"{start:g}"))
     listed = table(rows, ("parameter", "value", "bounds", "start"), "numbers")
-    return section("Parameters of the best centre", listed, id_="parameters")
+    return section(f"Parameters of the best {data.evaluated[0]}", listed, id_="parameters")
 
 
 def _time(data: RunData) -> Markup:

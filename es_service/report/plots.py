@@ -40,6 +40,9 @@ WALL, PATH = "#1d2126", "#d55e00"
 def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
     """Draw the behaviour map of a run with a descriptor of one or two dimensions, with its walls and its goal.
 
+    A cvt map of two dimensions has a hexagon for each elite, at the centroid of its cell. If the task has walls, it is
+    at the elite's descriptor, since the centroid may be on the other side of a wall.
+
     Args:
         colours: fitness of the first and last colour; None: those of this map.
 
@@ -77,11 +80,14 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
         beside = np.array([fitness_of[cell] for cell in parts])
         axes.add_collection(collections.PolyCollection(corners, array=beside, zorder=1.1, **style))
         return axes.pcolormesh(*geometry.edges, filled.T, zorder=1, rasterized=True, **style)
-    return axes.scatter(*geometry.centroid_C_B[map_.cell_N].T, c=map_.fitness_N, marker="h", zorder=1, **style)
+    place_N_2 = geometry.centroid_C_B[map_.cell_N]
+    if data.task.walls:
+        place_N_2 = np.clip(map_.descriptor_N_B, *np.transpose(data.bounds))
+    return axes.scatter(*place_N_2.T, c=map_.fitness_N, marker="h", zorder=1, **style)
 
 
 def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
-    """Draw all evaluated centres of a run at the first two dimensions of their descriptors, coloured by fitness.
+    """Draw all evaluated centres, or policies, at the first two dimensions of their descriptors, coloured by fitness.
 
     With one dimension, the vertical axis is fitness. Where centres overlap, the fittest is seen.
 

@@ -20,7 +20,7 @@ MOST_POINTS = 300
 X_AXES = {"generation": "generation", "env_steps": "environment steps", "wall_clock_s": "seconds"}
 """History columns that curves can be drawn against -> labels."""
 PHASES = {
-    "seconds_rollout": "training episodes",
+    "seconds_rollout": "episodes of the population",
     "seconds_gradient": "gradient",
     "seconds_evaluation": "evaluation",
     "seconds_driver": "driver",
@@ -68,8 +68,8 @@ QD_ABOVE_LEAST = "qd_score_above_least"
 _SPECS = (
     _Spec(
         "Fitness",
-        "Mean over the evaluation episodes of a {evaluated}; of the population, single training episodes with noise. "
-        "Corrected: in the new episodes of map.correct_every.",
+        "Mean over the evaluation episodes of a {evaluated}; of the population, the episodes of its members, which are "
+        "training episodes with noise where a centre moves. Corrected: in the new episodes of map.correct_every.",
         (
             ("best {evaluated} so far", "best_fitness", "last"),
             ("{evaluated}", "centre_fitness_mean", "mean"),
@@ -105,7 +105,7 @@ _SPECS = (
     ),
     _Spec(
         "Novelty of the {evaluated}",
-        "Mean distance of its descriptor to the nearest centres evaluated before.",
+        "Mean distance of its descriptor to the nearest ones that were in the novelty archive before it.",
         (("novelty", "centre_novelty", "mean"),),
     ),
     _Spec(

@@ -13,7 +13,7 @@ GAUGES = {
     "generation": ("generation", "Newest committed generation."),
     "env_steps": ("env_steps", "Environment steps until then."),
     "steps_per_second": ("steps_per_second", "Environment steps a second of the newest generation."),
-    "best_fitness": ("best_fitness", "Highest mean fitness of an evaluated centre: selected, not certified."),
+    "best_fitness": ("best_fitness", "Highest mean fitness of an evaluated centre or policy: selected, not certified."),
     "coverage": ("coverage", "Filled cells as a share of all cells."),
     "workers": ("workers", "Workers of the newest generation."),
 }

@@ -309,6 +309,27 @@ def test_a_plot_of_a_map_has_its_values_where_they_are(folders, runs, axes):
     assert len(axes.lines) == 3  # two walls and the goal
 
 
+def test_an_elite_of_a_cvt_map_is_plotted_on_its_side_of_a_wall(tmp_path, axes):
+    """Where there are walls, at its descriptor; elsewhere at the centroid of its cell."""
+    maze = read_run(write_run(tmp_path / "maze", {"map.kind": "cvt", "map.cells": [30]}))
+    centroid_N_B = maze.map.geometry.centroid_C_B[maze.map.cell_N]
+    descriptor_N_B = centroid_N_B + 0.01
+    descriptor_N_B[0] = (0.25, 7.0)  # beyond the bounds, which are from -1 to 1
+    maze = replace(maze, map=replace(maze.map, descriptor_N_B=descriptor_N_B))
+    shown_N_B = np.concatenate([[(0.25, 1.0)], descriptor_N_B[1:]])
+    np.testing.assert_array_equal(plots.behaviour_map(maze, axes).get_offsets(), shown_N_B)
+    plain = replace(maze, task=replace(maze.task, walls=None))
+    np.testing.assert_array_equal(plots.behaviour_map(plain, axes).get_offsets(), centroid_N_B)
+
+
+def test_of_two_runs_in_the_middle_the_page_says_that_the_map_is_of_the_lower(runs):
+    lower = min(runs[:2], key=lambda run: run.last("best_fitness"))
+    assert compare.median_run(compare.grouped(runs[:2])[0]) is lower
+    said = "whose best fitness is the median (of an even number of runs, the lower of the two in the middle);"
+    assert said in words(comparison_page(runs[:2]))
+    assert "whose best fitness is the median;" in words(comparison_page(runs[:3]))
+
+
 def test_an_overview_has_all_centres_of_each_group_in_the_same_colours(runs):
     figure = empty_figure()
     draw_overview(runs, figure, threshold=float(runs[0].history["best_fitness"][-1]))

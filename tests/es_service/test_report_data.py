@@ -96,7 +96,7 @@ def test_faults_are_counted(folder):
 def test_phases_add_up(folder):
     seconds = series.phase_seconds(read_run(folder).history)
     assert seconds == pytest.approx(
-        {"training episodes": 1.26, "gradient": 0.21, "evaluation": 0.42, "driver": 0.105, "store": 0.105}
+        {"episodes of the population": 1.26, "gradient": 0.21, "evaluation": 0.42, "driver": 0.105, "store": 0.105}
     )
 
 

@@ -203,6 +203,21 @@ def test_generation_0_alone_and_a_run_without_a_map_have_pages(tmp_path, setting
     assert ("no behaviour map" if settings else "No cell is filled yet") in page
 
 
+def test_captions_are_true_of_a_run_that_moves_no_centre(tmp_path):
+    moving = read_run(write_run(tmp_path / "run"))
+    still = replace(moving, history={**moving.history, "update_norm": np.full(21, np.nan)})
+    pages = [run_page(data, python_call(data.folder)) for data in (moving, still)]
+    for page, one, several in zip(pages, ("centre", "policy"), ("centres", "policies"), strict=True):
+        assert f"<h2>Evaluated {several}</h2>" in page
+        assert f'aria-label="Evaluated {several}"' in page
+        assert f"Each point is an evaluated {one}, at its mean descriptor" in page
+        assert f"generation 20: 21 {several}, best" in page
+        assert "single training episodes" not in page
+        assert "training episodes with noise where a centre moves" in page
+        assert "nearest ones that were in the novelty archive before it" in page
+        assert "episodes of the population" in page
+
+
 def test_a_run_before_its_first_generation_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run")
     execute(folder, "DELETE FROM history")

@@ -96,6 +96,14 @@ def test_what_the_centres_climb_is_told_of_all_and_not_of_the_fittest(search, ex
     assert re.findall("\n((?:centres|weight of fitness|objectives) .*)", capsys.readouterr().out) == expected
 
 
+def test_the_spread_of_one_episode_is_not_told(console, tmp_path, capsys):
+    for episodes, spread in ((1, ""), (2, " ± 1.00")):
+        run = api.open_run(write_run(tmp_path / str(episodes), {"search.evaluation_episodes": episodes}))
+        print_status(console, run)
+        [shown] = re.findall("\ncentre fitness +(.*)\n", capsys.readouterr().out)
+        assert shown == f"{read_status(run).row['centre_fitness_mean']:.2f}{spread}"
+
+
 def test_with_one_centre_a_generation_the_share_is_that_of_recent_generations(console, tmp_path, monkeypatch, capsys):
     """It exploited in generations 10 to 19, and explored before and after."""
     run = api.open_run(write_run(tmp_path / "run", generations=20))

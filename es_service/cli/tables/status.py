@@ -10,7 +10,7 @@ from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
 from es_service.cli.tables.certified import certified_line
 from es_service.errors import StoreError, counted
-from es_service.loop.history import evaluated_word
+from es_service.loop.history import evaluated_nouns
 from es_service.report.progress import plain_line
 from es_service.runs.certified import newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
@@ -106,6 +106,8 @@ def _progress(status: RunStatus) -> dict[str, str]:
         offset = status.run.constants["map.qd_offset"]
         if last["qd_score"] < 0.0 or last["centre_fitness_mean"] < offset:
             filled["map"] += f", which elites below map.qd_offset = {offset:g} lower"
+    nouns, episodes = evaluated_nouns(last), status.run.constants["search.evaluation_episodes"]
+    spread = f" ± {last['centre_fitness_std']:.2f}" if episodes > 1 else ""  # that of one episode is not known
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     recent = read_recent(status.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
@@ -114,10 +116,10 @@ def _progress(status: RunStatus) -> dict[str, str]:
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
         "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
-        f"{evaluated_word(last)} fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
+        f"{nouns[0]} fitness": f"{last['centre_fitness_mean']:.2f}{spread}",
         **goal,
         **filled,
-        "novelty archive": counted(last["archive_size"], "centre"),
+        "novelty archive": counted(last["archive_size"], *nouns),
         **_objectives(status.run, recent),
         "environment steps": f"{steps} in {counted(last['episodes'], 'episode')}",
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
