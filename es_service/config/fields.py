@@ -20,6 +20,11 @@ def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def counts(value: Any) -> Any:
+    """A list as a tuple, and a single whole number as a tuple of one."""
+    return (value,) if type(value) is int else as_tuple(value)
+
+
 def _tuples(value: Any) -> Any:
     """Convert nested lists to tuples and whole numbers in them to floats, for values such as [[-1, 1], [0, 2.5]]."""
     if not isinstance(value, list | tuple):
@@ -57,8 +62,8 @@ BoundPairs = Annotated[Bounds, BeforeValidator(_tuples), "a list of pairs [low, 
 CellCounts = Annotated[
     tuple[Count, ...],
     Field(min_length=1),
-    BeforeValidator(as_tuple),
-    "a list of whole numbers, each at least 1, such as [20, 20]",
+    BeforeValidator(counts),
+    "a list of whole numbers, each at least 1, such as [20, 20], or one such number",
 ]
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from es_service.config.fields import counts
 from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, problem_of
 from es_service.config.yaml_text import show
@@ -70,7 +71,7 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Problems of a map that does not fit the descriptor or is too large."""
     problems = []
     names = with_options(task, options_of(values)).descriptor_names
-    bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
+    bounds, cells, kind = values.get("map.bounds"), counts(values.get("map.cells")), values.get("map.kind")
     qd_offset, how = values.get("map.qd_offset", 0.0), values.get("map.centroids", "lloyd")
     if bounds is None and "map.bounds" in values:
         what = f"missing, since the descriptor of {task.name} has no bounds; give [low, high] for each of"

@@ -217,6 +217,12 @@ def test_numbers_as_people_write_them_are_floats(file, text, value):
     assert config.budget.target_fitness == value
 
 
+def test_a_single_number_of_cells_is_a_list_of_one():
+    for text in ("50", "[50]"):
+        assert load(MINIMAL, "map.kind=cvt", f"map.cells={text}").map.cells == (50,)
+    assert load(MINIMAL | {"map": {"kind": "cvt", "cells": 50}}).map.cells == (50,)
+
+
 def test_whole_numbers_may_have_underscores_and_leading_zeros(file):
     assert load(file(MINIMAL_TEXT.replace("generations: 3", "env_steps: 1_000_000"))).budget.env_steps == 1_000_000
     assert load(file(MINIMAL_TEXT + "seed: 012\n")).seed == 12
