@@ -18,6 +18,7 @@ from es_service.config.methods import (
     filled_in,
     has_effect,
     kinds_without,
+    method_problems,
     only_centres,
     parts_of,
     search_fields,
@@ -96,7 +97,7 @@ def foreign_keys(
     values: Mapping[str, Any], wanted: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
 ) -> dict[str, str]:
     """Keys that go with the task, the algorithm or a part of a config, if `wanted` replaces that and what replaces it
-    does not use them; each with a clause that says what is replaced.
+    does not use them, or an algorithm does not allow their values; each with a clause that says what is replaced.
 
     Args:
         settings: those of the method with `wanted`; None if it is not known.
@@ -117,6 +118,9 @@ def foreign_keys(
         known = {*known, *settings.unused}
         why = _replaces("search.algorithm", wanted["search.algorithm"])
         foreign |= {key: why for key in values if key in known and not has_effect(key, settings)}
+        forbidden = [problem.field or "" for problem in method_problems(chosen, settings)]
+        forbidden += [derived for key in forbidden for derived in DERIVED_KEYS.get(key, ())]
+        foreign |= {key: why for key in values if key in forbidden}
     for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
         if other or is_replaced(kind):
             why = _replaces(kind, chosen[kind])

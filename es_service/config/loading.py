@@ -77,7 +77,7 @@ def load_config(
         source: a YAML file, the name of a shipped config, or a nested mapping with the content of one.
         overrides: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
             mapping from key to value. If they choose another task or algorithm, keys of the source that go with its
-            own one are dropped; `left_out` returns those.
+            own one are dropped, and so are values that the chosen algorithm does not allow; `left_out` returns those.
         tasks: the tasks that `task.environment` may name.
         algorithms: the methods that `search.algorithm` may name, of which the first is the simplest.
         rollouts: the rollouts that `compute.rollout` may name.
@@ -94,7 +94,7 @@ def load_config(
 
 def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
     """Keys that `load_config` drops because the overrides choose another task, algorithm or kind of a part, which does
-    not use them; each with a clause that says so.
+    not use them or allow their values; each with a clause that says so.
 
     `source` and `overrides` must be ones that `load_config` accepts.
     """

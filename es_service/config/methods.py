@@ -124,10 +124,10 @@ def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: A
 
 
 def method_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> list[Problem]:
-    """Problems of settings that the method does not support."""
+    """Problems of settings that the method does not support; each has the key as its field."""
     method, problems = values["search.algorithm"], []
     centres, only = values.get("search.centres"), only_centres(values, settings)
-    if only is not None and centres not in (None, only):
+    if only is not None and centres not in (None, "auto", only):
         each = "" if isinstance(settings.only_centres, int) else f" for each of {settings.only_centres}"
         why = f" for {method}, which has one centre{each}"
         problems.append(not_allowed("search.centres", centres, f"{only} or auto", why=why))
