@@ -16,7 +16,7 @@ from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.newest_output import NewestOutput
-from es_service.protocol.process_environment import worker_environment
+from es_service.protocol.process_environment import DEPTH, worker_environment
 from es_service.protocol.raised import sendable
 from es_service.protocol.sources import OtherCodeError, why_refused
 from workers import progress
@@ -77,7 +77,7 @@ class WorkerActor:
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
-        os.environ.update(environment | xla_cache_settings())
+        os.environ.update({DEPTH: "1"} | environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
         from workers.gpu import platform_of_gpu
         from workers.parents import Parents

@@ -1,10 +1,10 @@
 """Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX, or code
 of the user.
 
-    python -m workers.describe NAME [SETTINGS]
+    python -m workers.describe NAME SETTINGS ANSWER
 
 SETTINGS is JSON, what `describe_environment` of `workers.environments` takes.
-Prints one line of JSON: {"task": fields of a TaskSpec} or {"problem": text}.
+Writes JSON to the file ANSWER: {"task": fields of a TaskSpec} or {"problem": text}.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import option_values
+from es_service.protocol.parent import end_soon, write_answer
 from workers.environments import TaskError, describe_environment
 from workers.host.repeats import tried_apart
 from workers.rollouts import BACKENDS
@@ -44,8 +45,8 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
     )
 
 
-def main(name: str, settings: str = "{}") -> None:
-    """Print the description of a task, or the problem with it, as JSON."""
+def main(name: str, settings: str, file: str) -> None:
+    """Write the description of a task, or the problem with it, as JSON to a file."""
     try:
         given = json.loads(settings)
         task = described(name, given)
@@ -59,8 +60,9 @@ def main(name: str, settings: str = "{}") -> None:
         answer = {"task": dataclasses.asdict(task)}
     except TaskError as error:
         answer = {"problem": str(error)}
-    print(json.dumps(answer))
+    write_answer(file, json.dumps(answer).encode())
 
 
 if __name__ == "__main__":
     main(*sys.argv[1:])
+    end_soon()

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.parent import end_soon, write_answer
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers.rollouts import BACKENDS
 from workers.xla_cache import xla_cache_settings
@@ -24,12 +25,13 @@ def record(spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
     return BACKENDS[spec.rollout].record(spec, requests)
 
 
-def main(requests: Path, answer: Path) -> None:
+def main(requests: str, file: str) -> None:
     """Answer the requests of a file."""
     os.environ.update(xla_cache_settings())
-    spec, wanted = pickle.loads(requests.read_bytes())
-    answer.write_bytes(pickle.dumps(record(spec, wanted)))
+    spec, wanted = pickle.loads(Path(requests).read_bytes())
+    write_answer(file, pickle.dumps(record(spec, wanted)))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*sys.argv[1:])
+    end_soon()

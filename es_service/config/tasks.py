@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -22,7 +21,8 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
 from es_service.protocol.options import Option, OptionValue, choice, option_values
 from es_service.protocol.parameters import ParameterSpec
-from es_service.protocol.process_environment import child_environment
+from es_service.protocol.parent import answer_of
+from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import task_code, user_sources
 from workers import environments
@@ -50,6 +50,7 @@ class Tasks(Mapping[str, TaskSpec]):
             return caller_task(options)
         if ":" not in name:
             return environments.SHIPPED[name]
+        require_no_import_of_a_task()
         settings = environments.settings_of_description(name, options, descriptor)
         code = tuple(user_sources(*task_code(name, descriptor)).items())
 
@@ -109,21 +110,12 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     Args:
         settings: what a config chooses for it, as JSON.
     """
-    try:
-        process = subprocess.run(
-            [sys.executable, "-m", "workers.describe", name, settings],
-            env=child_environment(),
-            capture_output=True,
-            text=True,
-            timeout=DESCRIBE_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise ConfigError(f"{name} could not be imported and described within {DESCRIBE_S:g} s") from None
-    lines = process.stdout.splitlines()
-    if process.returncode or not lines:
-        raise ConfigError(f"{name} could not be imported or described:\n{process.stderr.strip()}")
-    answer = json.loads(lines[-1])
+    told = answer_of([sys.executable, "-m", "workers.describe", name, settings], DESCRIBE_S)
+    if told.content is None:
+        if told.code is None:
+            raise ConfigError(f"{name} could not be imported and described within {DESCRIBE_S:g} s")
+        raise ConfigError(f"{name} could not be imported or described:\n{told.errors}")
+    answer = json.loads(told.content)
     if "problem" in answer:
         problem = answer["problem"]
         named = re.match(r"(task\.(?:descriptor|options\.\w+)) = ", problem)

@@ -1,6 +1,7 @@
 """Binds the life of a child process to that of its parent.
 
 `python -m es_service.protocol.parent PARENT MODULE ARGUMENT...` runs a module in a process that is bound like this.
+`answer_of` has a child process answer one question.
 """
 
 from __future__ import annotations
@@ -11,14 +12,20 @@ import runpy
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from queue import SimpleQueue
 
 from es_service.protocol.errors import ForkedError
+from es_service.protocol.newest_output import NewestOutput
+from es_service.protocol.process_environment import child_environment
 
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
@@ -26,6 +33,10 @@ _GUARD = ("/bin/sh", "-c", "read -r _; kill -9 0")
 """Ends its process group once nobody holds the other end of its input any more."""
 LOOK_S = 0.2
 """Seconds between two looks for the parent, where the kernel does not tell of its death."""
+END_S = 2.0
+"""Longest time in seconds between the answer of a child process and its end."""
+ERRORS_BYTES = 2**16
+"""At most this many bytes are stored of what such a child prints as errors."""
 
 
 def end_with(parent: int) -> None:
@@ -81,6 +92,72 @@ def guard_of(child: subprocess.Popen[bytes]) -> subprocess.Popen[bytes]:
     """A process that ends a child, which must be the first of its process group, and all that it has started, when this
     process ends, for whatever reason. `end_with` ends the child alone."""
     return subprocess.Popen(_GUARD, stdin=subprocess.PIPE, process_group=child.pid)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a child process has answered."""
+
+    content: bytes | None
+    """What it has written to its file; None if it has ended, or its time was over, without an answer."""
+    code: int | None
+    """Its exit code; None if its time was over."""
+    errors: str
+    """The newest part of what it printed as errors."""
+
+
+def answer_of(command: Sequence[str], seconds: float) -> Answer:
+    """What a child process writes to the file that is the last argument of its command, see `write_answer`.
+
+    It has the environment of a worker. Code of the user in it may start processes that hold its output open; its end
+    alone is waited for, and then all that is still in its process group is killed.
+
+    Args:
+        command: the words before the name of the file.
+        seconds: longest time; the child is killed then.
+    """
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tempfile.TemporaryFile() as errors,
+        closing(NewestOutput(ERRORS_BYTES)) as output,
+        ExitStack() as ends,
+    ):
+        file, code = Path(folder) / "answer", None
+        output.add(errors.fileno())
+        child = subprocess.Popen(
+            [*command, str(file)],
+            env=child_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            process_group=0,
+        )
+        ends.callback(child.wait)
+        ends.callback(child.kill)
+        ends.callback(guard_of(child).communicate)  # the group has its number until the guard has ended
+        with suppress(subprocess.TimeoutExpired):
+            code = child.wait(seconds)
+        ends.close()
+        errors.seek(0)
+        content = file.read_bytes() if file.exists() else None
+        return Answer(content, code, errors.read().decode(errors="replace").strip())
+
+
+def write_answer(file: str, content: bytes) -> None:
+    """Answer `answer_of`. The file exists only with all of its content."""
+    partial = Path(f"{file}.partial")
+    partial.write_bytes(content)
+    partial.rename(file)
+
+
+def end_soon() -> None:
+    """Have this process, whose main thread has nothing left to do, end within END_S seconds.
+
+    Python waits for threads and calls functions of the user's code that need not end.
+    """
+    timer = threading.Timer(END_S, os._exit, (0,))
+    timer.daemon = True
+    timer.start()
 
 
 @cache

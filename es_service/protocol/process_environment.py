@@ -9,6 +9,8 @@ import os
 import sys
 from collections.abc import Mapping
 
+from es_service.protocol.errors import TaskError
+
 GPU_MEMORY_FRACTION = 0.9
 """Fraction of a GPU's memory that workers may use; workers that share a GPU divide it among them."""
 GPU_SETTINGS = {
@@ -17,6 +19,10 @@ GPU_SETTINGS = {
     "XLA_FLAGS": "--xla_gpu_deterministic_ops=true --xla_gpu_autotune_level=0",
 }
 """Settings with which a GPU repeats its own bits, which differ from those of a CPU."""
+DEPTH = "ES_SERVICE_DEPTH"
+"""Variable of a process that runs code of a task: how many processes above it, and itself, do so."""
+MOST_DEPTH = 3
+"""In a process of this depth, no other run may start: code that starts a run of itself would never end doing so."""
 
 
 def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dict[str, str]:
@@ -56,4 +62,33 @@ def child_environment(gpus: float = 0.0, place: str = "") -> dict[str, str]:
         gpus: as for `worker_environment`.
         place: what CUDA_VISIBLE_DEVICES must be, with GPUs.
     """
-    return worker_environment({**os.environ, "CUDA_VISIBLE_DEVICES": place}, gpus) | same_imports()
+    worker = worker_environment({**os.environ, "CUDA_VISIBLE_DEVICES": place}, gpus)
+    return worker | same_imports() | {DEPTH: str(_depth() + 1)}
+
+
+def _depth() -> int:
+    return int(os.environ.get(DEPTH, "0"))
+
+
+def require_no_import_of_a_task() -> None:
+    """Raise TaskError in a process that describes a task or computes its episodes, if this is called by a module that
+    is being imported: each such process would import the module, too, and start further ones without end.
+
+    A function that is called later may have runs of its own, down to MOST_DEPTH.
+    """
+    if not _depth():
+        return
+    frame = sys._getframe(1)
+    while frame is not None:
+        name, spec = map(frame.f_globals.get, ("__name__", "__spec__"))
+        if frame.f_code.co_name == "<module>" and name != "__main__" and spec is not None:
+            raise TaskError(
+                f"a run cannot start while {name} is imported, since the processes that run the code of a task import "
+                f'it, too; put the call below `if __name__ == "__main__":` in {name}'
+            )
+        frame = frame.f_back
+    if _depth() >= MOST_DEPTH:
+        raise TaskError(
+            f"the code of a task starts a run, and so does the code of that run's task, {MOST_DEPTH} deep; put calls "
+            'that start a run below `if __name__ == "__main__":`'
+        )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.protocol.process_environment import child_environment
+from es_service.protocol.parent import answer_of
 from es_service.runs.view import Run
 from workers.environments import settings_of_description
 
@@ -28,16 +27,12 @@ def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str
         seconds: duration of its measurement.
     """
     command = [sys.executable, "-m", "workers.host.examine", name, json.dumps(settings), str(seconds)]
-    try:
-        process = subprocess.run(
-            command, env=child_environment(), capture_output=True, text=True, timeout=LONGEST_S, check=False
-        )
-    except subprocess.TimeoutExpired:
+    told = answer_of(command, LONGEST_S)
+    if told.content is not None:
+        return json.loads(told.content)
+    if told.code is None:
         return {"problem": f"it could not be examined within {LONGEST_S:g} s"}
-    lines = process.stdout.splitlines()
-    if process.returncode or not lines:
-        return {"problem": f"its process ended with exit code {process.returncode}:\n{process.stderr.strip()[-2000:]}"}
-    return json.loads(lines[-1])
+    return {"problem": f"its process ended with exit code {told.code}:\n{told.errors[-2000:]}"}
 
 
 def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:

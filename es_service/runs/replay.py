@@ -9,13 +9,10 @@ is recorded, which shows neither its luck nor its bad luck.
 from __future__ import annotations
 
 import pickle
-import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,9 +24,8 @@ from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import FloatArray
-from es_service.protocol.newest_output import NewestOutput
 from es_service.protocol.noise import Domain
-from es_service.protocol.process_environment import child_environment
+from es_service.protocol.parent import answer_of
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.certified import newest_certified
 from es_service.runs.checked_config import changed_config
@@ -43,8 +39,6 @@ CERTIFIED = "certified"
 """Name of the certified policy as a candidate, whose generation is the number of the certification."""
 RECORD_S = 600.0
 """Longest time for the recordings of one report, compilation included."""
-ERRORS_BYTES = 2**16
-"""Most bytes that are kept of what a recording prints as errors, of which the last line is told."""
 
 
 @dataclass(frozen=True)
@@ -152,28 +146,13 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
 
 
 def _answer(question: tuple) -> Recordings:
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        tempfile.TemporaryFile() as errors,
-        closing(NewestOutput(ERRORS_BYTES)) as output,
-    ):
-        requests, answer = Path(folder) / "requests", Path(folder) / "answer"
-        requests.write_bytes(pickle.dumps(question))
-        output.add(errors.fileno())
-        words = [sys.executable, "-m", "workers.recording", str(requests), str(answer)]
-        try:
-            process = subprocess.run(
-                words,
-                env=child_environment(),
-                stdout=subprocess.DEVNULL,
-                stderr=errors,
-                timeout=RECORD_S,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise EvaluationError(f"episodes could not be recorded within {RECORD_S:g} s; choose fewer") from None
-        if process.returncode:
-            errors.seek(0)
-            last = (errors.read().decode(errors="replace").strip().splitlines() or ["it printed nothing"])[-1]
-            raise EvaluationError(f"episodes could not be recorded: {last}")
-        return pickle.loads(answer.read_bytes())
+    with tempfile.NamedTemporaryFile() as requests:
+        requests.write(pickle.dumps(question))
+        requests.flush()
+        told = answer_of([sys.executable, "-m", "workers.recording", requests.name], RECORD_S)
+    if told.content is not None:
+        return pickle.loads(told.content)
+    if told.code is None:
+        raise EvaluationError(f"episodes could not be recorded within {RECORD_S:g} s; choose fewer")
+    last = (told.errors.splitlines() or ["it printed nothing"])[-1]
+    raise EvaluationError(f"episodes could not be recorded: {last}")

@@ -26,6 +26,7 @@ from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
+from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
@@ -297,6 +298,7 @@ def make_engine(
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
         outputs: see `WorkerSpec.outputs`.
     """
+    require_no_import_of_a_task()
     task, compute = task_of(config), config.compute
     spec = worker_spec(config, task, outputs)
     most = work_at_once(config) if at_once is None else at_once

@@ -18,6 +18,7 @@ from es_service.config.tasks import task_of
 from es_service.dispatch import dispatch_log
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
+from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs import targets
 from es_service.runs.certified import target_reached
 from es_service.runs.checked_config import accepted
@@ -58,6 +59,7 @@ def create_run(
     Args:
         again: the call that was made, which ways out repeat with other settings.
     """
+    require_no_import_of_a_task()
     require_cores(config, again)
     is_new, task = not folder.exists(), task_of(accepted(config))
     require_episodes(task, asks_caller=listener.caller is not None)

@@ -1,8 +1,9 @@
 """Try a task: whether its numbers are finite, and one of Python objects or a function whether it repeats and how fast.
 
-    python -m workers.host.examine NAME SETTINGS SECONDS     # what `workers.describe` takes, and how long to measure
+    python -m workers.host.examine NAME SETTINGS SECONDS ANSWER
 
-Prints one line of JSON: {"problem": text}, or the fields of `Examined`. `es-service doctor TASK` runs it in two
+NAME and SETTINGS are what `workers.describe` takes; SECONDS is how long to measure.
+Writes JSON to the file ANSWER: {"problem": text}, or the fields of `Examined`. `es-service doctor TASK` runs it in two
 processes and compares their hashes.
 """
 
@@ -21,6 +22,7 @@ import numpy as np
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
+from es_service.protocol.parent import end_soon, write_answer
 from es_service.protocol.raised import raised
 from es_service.protocol.rollouts import choose
 from es_service.protocol.system import peak_memory_mib
@@ -156,8 +158,8 @@ def _hash(said: list[Any]) -> str:
     return hasher.hexdigest()
 
 
-def main(name: str, settings: str, seconds: str) -> None:
-    """Print the findings about a task, or its problem, as JSON."""
+def main(name: str, settings: str, seconds: str, file: str) -> None:
+    """Write the findings about a task, or its problem, as JSON to a file."""
     try:
         given = json.loads(settings)
         task = described(name, given)
@@ -167,8 +169,9 @@ def main(name: str, settings: str, seconds: str) -> None:
         answer = {"problem": str(error)}
     except Exception as error:  # the user's code can raise anything
         answer = {"problem": raised(error, name).message}
-    print(f"\n{json.dumps(answer)}")  # on a line of its own, whatever the user's code prints
+    write_answer(file, json.dumps(answer).encode())
 
 
 if __name__ == "__main__":
     main(*sys.argv[1:])
+    end_soon()
