@@ -186,14 +186,14 @@ def _load(
         ),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):
-        given = chosen.get(key)
+        given, allowed = chosen.get(key), f"{one_of(known)}, or {besides}"
         if key not in chosen and key.split(".")[0] not in unusable:
-            unknown.append(problem_of(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
+            unknown.append(problem_of(key, None, f"missing; must be {allowed}", allowed=allowed))
         try:
             named = isinstance(given, str) and given != ""
             selected[key] = _looked_up(known, str(given), values, wanted) if named else None
         except KeyError:
-            allowed, meant = f"{one_of(known)}, or {besides}", nearest(given, known)
+            meant = nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""
             sentence = f"{key}: {show(given)} is not a known {what}; must be {allowed}{hint}"
             unknown.append(Problem(sentence, key, given, allowed, meant))

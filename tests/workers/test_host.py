@@ -29,7 +29,9 @@ from tests.workers import host_tasks
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import Lanes
+from workers.host.examine import examine
 from workers.host.policies import LanePolicies
+from workers.host.repeats import does_not_repeat
 from workers.worker import make_worker
 
 MODULE = "tests.workers.host_tasks"
@@ -406,8 +408,20 @@ STEP = (
         (
             "step",
             lambda self, action: ([0.0] * 3, 1.0, np.array([False, True])),
-            rf"done = array\(.*not one bool; {STEP}",
+            rf"done = array\(.*not one bool \(or 0 or 1\); {STEP}",
         ),
+        (
+            "step",
+            lambda self, action: ([0.0] * 3, False, 1.0),
+            rf"returned the reward False and done = 1.0 \(are the two swapped\?\); {STEP}",
+        ),
+        (
+            "step",
+            lambda self, action: ([0.0] * 3, 1.0, np.nan),
+            rf"returned done = nan, which is not one bool .*; {STEP}",
+        ),
+        ("step", lambda self, action: ([0.0] * 3, False, -0.5, False, {}), r"terminated = -0.5 \(are the two swapped"),
+        ("step", lambda self, action: ([0.0] * 3, 0, -0.5), "returned done = -0.5, which is not one bool"),
         (
             "step",
             lambda self, action: ([0.0] * 3, 1.0, False, None, {}),
@@ -492,6 +506,23 @@ def test_arrays_of_the_object_are_copied_and_it_gets_arrays_of_its_own():
     for action in unchanged(given):
         environment.step(action)
     assert (given == np.float32(0.9)).all()
+
+
+class Halving(host_tasks.Drift):
+    """It halves its action in place."""
+
+    action_bounds = None
+
+    def step(self, action):
+        action *= 0.5
+        return super().step(action)
+
+
+def test_a_task_that_changes_its_actions_in_place_repeats_itself():
+    name = f"python:{__name__}:Halving"
+    task = describe_environment(name)
+    assert len(set(examine(task, {}, 0.0).hashes.values())) == 1
+    assert does_not_repeat(task, {}) == ""
 
 
 def test_a_constructor_must_not_change_what_a_run_takes_from_the_class(monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -93,7 +94,7 @@ def _size(task: HostTask, choice: str, action_size: int) -> int:
     (action,) = task.actions(np.zeros((1, action_size), np.float32))
     environment.reset(0)
     for _ in range(SOME_STEPS):
-        done = environment.step(action)[2]
+        done = environment.step(copy(action))[2]
         if ":" in choice or choice in environment.info:
             return environment.measured_size()
         if done:

@@ -10,6 +10,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
 from textwrap import shorten
@@ -111,11 +112,11 @@ class HostEnvironment:
         if not isinstance(result, tuple | list) or len(result) not in (3, 5):
             returned = f"{len(result)} values" if isinstance(result, tuple | list) else _shown(result)
             raise self._broken("step", f"returned {returned}")
-        observation, reward, *ends = result
+        observation, given, *ends = result
         try:
-            episode, reward = self._episode, float(reward)
+            episode, reward = self._episode, float(given)
         except (TypeError, ValueError):
-            raise TaskError(f"{self._task.name}: step returned the reward {reward!r}; it must be a number") from None
+            raise TaskError(f"{self._task.name}: step returned the reward {given!r}; it must be a number") from None
         episode.observation_O, episode.steps = self._observed("step", observation), episode.steps + 1
         episode.info = ends[2] if len(ends) == 3 else {}
         self._require_info("step", episode.info)
@@ -126,8 +127,10 @@ class HostEnvironment:
         names = ("done",) if len(ends) == 1 else ("terminated", "truncated")
         has_ended = False
         for name, end in zip(names, ends, strict=False):
+            if isinstance(given, bool | np.bool_) and np.asarray(end).dtype.kind == "f":
+                raise self._broken("step", f"returned the reward {given} and {name} = {end} (are the two swapped?)")
             if (is_true := _bool(end)) is None:
-                raise self._broken("step", f"returned {name} = {_shown(end)}, which is not one bool")
+                raise self._broken("step", f"returned {name} = {_shown(end)}, which is not one bool (or 0 or 1)")
             has_ended |= is_true
         return episode.observation_O, reward, has_ended
 
@@ -220,7 +223,7 @@ def try_out(task: HostTask, action_size: int) -> set[str]:
         for seed in range(TRIED_STEPS):
             if done:
                 environment.reset(seed)
-            _, _, done = environment.step(action)
+            _, _, done = environment.step(copy(action))  # an object may change its array
             for ask in (environment.descriptor, environment.goal_distance, environment.success):
                 ask()
             keys |= {*environment.info}
@@ -273,11 +276,12 @@ def _array(value: Any) -> FloatArray | None:
 
 
 def _bool(value: Any) -> bool | None:
-    """What one bool or number says, also one in an array; None for anything else."""
+    """What one bool says, or 0 or 1, also in an array; None for anything else."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     array = np.asarray(value)
-    return bool(array.item()) if array.size == 1 and array.dtype.kind in "biuf" else None
+    is_number = array.size == 1 and array.dtype.kind in "biuf"
+    return bool(array.item()) if is_number and array.item() in (0, 1) else None
 
 
 def _shown(value: Any) -> str:

@@ -14,6 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -89,7 +90,7 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
         for action in actions_T[: min(STEPS, task.episode_steps)]:
             done = set()
             for lane in running:
-                result = environments[lane].step(action)
+                result = environments[lane].step(copy(action))  # an object may change its array
                 steps += 1
                 if lane == 0:
                     said.append((*result, environments[0].descriptor()))

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from copy import copy
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def does_not_repeat(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
         """Results of the steps, as far as there was time."""
         until, said = time.monotonic() + LONGEST_S, [environment.reset(seed).tobytes()]
         for action in actions_T[: task.episode_steps]:
-            observation_O, reward, done = environment.step(action)
+            observation_O, reward, done = environment.step(copy(action))  # an object may change its array
             said.append(np.array([*observation_O, reward, done], np.float64).tobytes())
             if done or time.monotonic() > until:
                 break
