@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from es_service.config.problems import did_you_mean, one_of
+from es_service.config.problems import did_you_mean_task, one_of
 from es_service.config.tasks import ROLLOUTS, TASKS
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
@@ -47,7 +47,7 @@ def bench_rollouts(
             raise ConfigError(
                 f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, gymnasium:ID, "
                 f"python:module:Class, function:module:name, or module:Class"
-                f"{did_you_mean(task, TASKS)}"
+                f"{did_you_mean_task(task, TASKS)}"
             )
     every = sorted({1, cores()})
     for task in tasks or TASKS:

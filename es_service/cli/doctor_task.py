@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from es_service.config.problems import did_you_mean, one_of
+from es_service.config.problems import did_you_mean_task, one_of
 from es_service.config.tasks import TASKS
 from es_service.dispatch.cluster_findings import Finding
 from es_service.errors import ConfigError, counted
@@ -20,8 +20,9 @@ def task_findings(name: str) -> Iterator[Finding]:
     try:
         task = TASKS[name]
     except KeyError:
+        hint = did_you_mean_task(name, TASKS)
         raise ConfigError(
-            f"{name} is not a known task; must be {one_of(TASKS)}, or the name of another{did_you_mean(name, TASKS)}",
+            f"{name} is not a known task; must be {one_of(TASKS)}, or the name of another{hint}",
             field="task.environment",
             value=name,
         ) from None

@@ -33,7 +33,7 @@ from es_service.config.methods import (
 from es_service.config.model import RunConfig
 from es_service.config.objective_rules import objective_problems
 from es_service.config.options import options_of, read_options, settings_of_task
-from es_service.config.problems import nearest, not_allowed, one_of, problem_of, wrong_value
+from es_service.config.problems import meant_task, nearest, not_allowed, one_of, problem_of, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
     engine_problems,
@@ -193,7 +193,7 @@ def _load(
             named = isinstance(given, str) and given != ""
             selected[key] = _looked_up(known, str(given), values, wanted) if named else None
         except KeyError:
-            meant = nearest(given, known)
+            meant = meant_task(str(given), known) if what == "task" else nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""
             sentence = f"{key}: {show(given)} is not a known {what}; must be {allowed}{hint}"
             unknown.append(Problem(sentence, key, given, allowed, meant))

@@ -8,12 +8,25 @@ from typing import Any
 
 from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError, Problem
+from es_service.protocol.sources import meant_environment
 
 
 def nearest(name: object, candidates: Collection[str]) -> str | None:
-    """The candidate most similar to a name; None if none is similar."""
-    near = get_close_matches(str(name), candidates, n=1)
-    return near[0] if near else None
+    """The candidate most similar to a name, in capitals or not; None if none is similar."""
+    small = {candidate.lower(): candidate for candidate in candidates}
+    near = get_close_matches(str(name).lower(), small, n=1)
+    return small[near[0]] if near else None
+
+
+def meant_task(name: str, known: Collection[str]) -> str | None:
+    """The task that a name may mean: a similar one that is known, or an environment of Gymnasium; else None."""
+    return nearest(name, known) or meant_environment(name) or None
+
+
+def did_you_mean_task(name: str, known: Collection[str]) -> str:
+    """`did_you_mean` for the name of a task."""
+    meant = meant_task(name, known)
+    return f"; did you mean {meant}?" if meant else ""
 
 
 def did_you_mean(name: object, candidates: Collection[str]) -> str:

@@ -13,10 +13,12 @@ import hashlib
 import importlib.machinery
 import importlib.util
 import os
+import re
 import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -126,6 +128,16 @@ def user_path(name: str) -> str:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")
         return f"{module}:{environment}" if separator else ""
     return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
+
+
+def meant_environment(name: str) -> str:
+    """The environment of Gymnasium that is meant by a name without its kind, or with another first word; empty if the
+    name does not end in a version, as an ID does and no class can."""
+    kind, _, rest = name.partition(":")
+    if not re.search(r"-v\d+$", name):
+        return ""
+    is_kind = rest and (kind in PATH_FOLLOWS or get_close_matches(kind.lower(), ("gym", LIBRARY)))
+    return f"{LIBRARY}:{rest if is_kind else name}"
 
 
 @cache

@@ -332,7 +332,9 @@ def _floats(name: str, given: ArrayLike, allowed: str) -> FloatArray:
     try:
         array = np.asarray(given)
         if array.dtype.kind not in "fiu":
-            raise ValueError(f"its type is {array.dtype}")
+            holds_policies = hasattr(next(iter(array.flat), None), "parameters_D")
+            hint = "; give the parameters_D of each policy" if holds_policies else ""
+            raise ValueError(f"its type is {array.dtype}{hint}")
     except (TypeError, ValueError) as error:
         raise _wrong(name, f"is no array of numbers ({error})", None, allowed) from error
     with np.errstate(over="ignore"):

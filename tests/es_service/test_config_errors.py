@@ -125,6 +125,9 @@ def test_halves_of_one_pair_are_refused(overrides):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
+        ("search.algorithm=ES", "did you mean es?"),
+        ("task.environment=Point_Maze", "did you mean point_maze?"),
+        ("task.environment=CartPole-v1", "did you mean gymnasium:CartPole-v1?"),
         ("search.sgima=1", "search.sgima: unknown key; did you mean search.sigma?"),
         ("serach.sigma=1", "did you mean search.sigma?"),
         ("sigma=1", "sigma: unknown key; did you mean search.sigma?"),

@@ -295,6 +295,67 @@ def test_a_reset_that_takes_its_key_for_one_of_jax_is_told_how_to_make_one():
     assert describe_environment(f"{HERE}:MakesOne").name == f"{HERE}:MakesOne"
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("gym:CartPole-v1", r"did you mean gymnasium:CartPole-v1\?"),
+        ("python:CartPole-v1", r"did you mean gymnasium:CartPole-v1\?"),
+        ("robots.arms:Arm-v0", r"did you mean gymnasium:robots.arms:Arm-v0\?"),
+        ("python:robots.arms.Arm", "such as python:robots.arms:Arm$"),
+        ("python:Arm", "such as python:my_module:Arm$"),
+        ("function:", "such as function:my_module:name$"),
+        (f"python:{HERE}:Pliant", rf"has no class Pliant; did you mean {HERE}:Plain\?"),
+        (f"{HERE}:still", rf"has no class still; did you mean {HERE}:Still\?"),
+        ("function:tests.examples.beam:baem", r"has no function baem; did you mean tests.examples.beam:beam\?"),
+        (f"{HERE}:Zqx", "has no class Zqx$"),
+        (f"{HERE}:Plain", rf"has no .*observe, .*; if it simulates in Python, did you mean python:{HERE}:Plain\?"),
+    ],
+)
+def test_what_a_name_may_mean_is_suggested(name, found):
+    with pytest.raises(TaskError, match=found):
+        describe_environment(name)
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "found"),
+    [
+        (
+            "step",
+            lambda self, state, action: None,
+            r"step returned None \(is a `return` missing\?\); it must return \(",
+        ),
+        ("step", lambda self, state, action: (state, 0.0), r"step returned \(\*, \*\); it must return \(state, reward"),
+        (
+            "step",
+            lambda self, state, action: (state, None, False),
+            r"step returned \(\*, None, \*\); its reward and done must not be None",
+        ),
+        ("observe", lambda self, state: None, r"observe returned None \(is a `return` missing\?\); it must return one"),
+        ("descriptor", lambda self, state: [state[0]] * 2, r"descriptor returned \[\*, \*\]; it must return one array"),
+        ("success", lambda self, state, before: None, r"success returned None \(is a `return` missing"),
+        ("goal_distance", lambda self, state: None, r"goal_distance returned None \(is a `return` missing"),
+    ],
+)
+def test_what_a_method_in_jax_does_not_return_is_said_in_one_sentence(method, value, found, monkeypatch):
+    monkeypatch.setattr(Named, method, value, raising=False)
+    with pytest.raises(TaskError, match=rf"^{HERE}:Named: {found}[^\n]*$"):
+        describe_environment(f"{HERE}:Named")
+
+
+def test_a_constructor_that_needs_arguments_is_refused_in_one_sentence(monkeypatch):
+    monkeypatch.setattr(Named, "__init__", lambda self, length: None)
+    monkeypatch.setattr(Plain, "__init__", lambda self, length: None)
+    for name in (f"{HERE}:Named", f"python:{HERE}:Plain"):
+        with pytest.raises(
+            TaskError, match=r"cannot be called with no arguments \(.*length.*\); give each[^\n]*$"
+        ) as caught:
+            describe_environment(name)
+        assert "\n" not in str(caught.value)
+    monkeypatch.setattr(Plain, "__init__", lambda self: None + 1)
+    with pytest.raises(TaskError, match=r"TypeError: unsupported operand[^$]*test_tasks.py"):
+        describe_environment(f"python:{HERE}:Plain")
+
+
 @pytest.mark.parametrize(("key", "known"), [("task.environment", TASKS), ("search.algorithm", ALGORITHMS)])
 def test_what_is_defined_in_a_notebook_belongs_into_a_file(key, known):
     with pytest.raises(ConfigError, match=r"put it in a file, such as my_maze\.py .*name it my_maze:MyMaze"):

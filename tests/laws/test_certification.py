@@ -334,9 +334,12 @@ def test_wrong_numbers_are_refused_before_anything_runs(finished, monkeypatch, w
         certify_run(run.folder, **wrong)
 
 
-def test_wrong_arguments_are_named():
+def test_wrong_arguments_are_named(finished):
+    run, _ = finished
     with pytest.raises(ConfigError, match="parameters has the shape"):
         certify(np.zeros((3, 2)), CONFIG)
+    with pytest.raises(ConfigError, match=r"parameters is no array .*; give the parameters_D of each policy"):
+        certify([run.policy("best")], CONFIG)
 
 
 def test_a_policy_has_a_name_or_a_place_that_may_be_an_array(finished):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, choice
-from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS
+from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, meant_environment
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -225,9 +225,12 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         from workers.environments import function_task
 
         return function_task.describe(rest)
+    if meant := meant_environment(name):
+        raise TaskError(f"{name} is no class; did you mean {meant}?")
     if kind in PATH_FOLLOWS:
-        what = "name" if kind == "function" else "Class"
-        raise TaskError(f"{name} has one colon; must be {kind}:module:{what}, such as {kind}:my_module:{rest or what}")
+        what, (module, _, last) = "name" if kind == "function" else "Class", rest.rpartition(".")
+        such_as = f"{kind}:{module or 'my_module'}:{last or what}"
+        raise TaskError(f"{name} has one colon; must be {kind}:module:{what}, such as {such_as}")
     from workers.environments import user_task
 
     return user_task.describe(name, options)

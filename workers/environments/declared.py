@@ -5,13 +5,14 @@ Tasks in JAX and tasks of Python objects share this; nothing here imports JAX.
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 from typing import Any
 
 from es_service.protocol.messages import Bounds, TaskKind, TaskSpec
-from es_service.protocol.options import Option
+from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.raised import why_not_imported
 from es_service.protocol.user_code import import_user_module, in_no_file
 from workers.environments import TaskError
@@ -57,8 +58,31 @@ def import_named(path: str, what: str = "class") -> Any:
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
     if not hasattr(imported, name):
-        raise TaskError(f"{path}: the module {module} has no {what} {name}")
+        fits = inspect.isclass if what == "class" else callable
+        own = {other.lower(): other for other, value in vars(imported).items() if fits(value)}
+        near = get_close_matches(name.lower(), own, 1)
+        hint = f"; did you mean {module}:{own[near[0]]}?" if near else ""
+        raise TaskError(f"{path}: the module {module} has no {what} {name}{hint}")
     return getattr(imported, name)
+
+
+def construct(task: Any, options: Mapping[str, OptionValue]) -> Any:
+    """An object of a user's class.
+
+    Raises:
+        TaskError: the constructor cannot be called with the options. Otherwise whatever it raises.
+    """
+    try:
+        return task(**options)
+    except TypeError as error:
+        if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
+            raise  # it was called, and its own code has raised
+        given = f"the options {', '.join(options)}" if options else "no arguments"
+        kind = getattr(task, "__qualname__", task)
+        raise TaskError(
+            f"the constructor of {kind} cannot be called with {given} ({error}); give each argument a default, and "
+            "declare in the attribute options what a config may set"
+        ) from None
 
 
 OF_EVERY_CLASS = ("final_fitness", "options", "walls", "wall_clearance", "goal", "least_reward", "goal_distance",

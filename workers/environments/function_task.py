@@ -37,7 +37,7 @@ from es_service.protocol.messages import Bounds, FloatArray, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options
 from es_service.protocol.parameters import FREE, ParameterSpec
 from workers.environments import TaskError
-from workers.environments.declared import are_finite, clashes, import_named, unknown_attributes, wrong_pairs
+from workers.environments.declared import are_finite, clashes, construct, import_named, unknown_attributes, wrong_pairs
 from workers.environments.host_descriptors import finite_bounds
 
 PREFIX = "function:"
@@ -139,7 +139,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> FunctionTask:
     parameters, wrong = _parameters(function)
     if parameters is None:
         raise TaskError(f"{PREFIX}{path}: {'; '.join(wrong)}")
-    call: Any = function(**options) if inspect.isclass(function) else function
+    call: Any = construct(function, options) if inspect.isclass(function) else function
     return FunctionTask(
         name=PREFIX + path,
         parameters=parameters,

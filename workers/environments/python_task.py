@@ -39,6 +39,7 @@ from workers.environments import TaskError
 from workers.environments.declared import (
     OF_EVERY_CLASS,
     are_finite,
+    construct,
     import_named,
     missing_names,
     task_of_class,
@@ -128,8 +129,8 @@ def make(path: str, options: Mapping[str, OptionValue]) -> HostTask:
     """A user's class as a task, whose objects are constructed with the task's options."""
     kind, name = import_named(path), PREFIX + path
 
-    def construct() -> Any:
-        environment = kind(**options)
+    def make_object() -> Any:
+        environment = construct(kind, options)
         for attribute in KEPT:
             of_class, of_object = getattr(kind, attribute, None), getattr(environment, attribute, None)
             if repr(of_class) != repr(of_object):
@@ -147,7 +148,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> HostTask:
     has_descriptor = hasattr(kind, "descriptor")
     return HostTask(
         name=name,
-        make=construct,
+        make=make_object,
         observation_size=kind.observation_size,
         flat=lambda observation: observation,
         actions=actions,

@@ -41,7 +41,7 @@ Observations are summed in float32, so their mean must be less than a thousand s
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -55,6 +55,7 @@ from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError
 from workers.environments.declared import (
     OF_EVERY_CLASS,
+    construct,
     import_named,
     missing_names,
     task_of_class,
@@ -98,7 +99,9 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
     task = import_named(path)
     lists = "workers/environments/user_task.py lists what a task must have"
     if missing := missing_names(task, (*ATTRIBUTES, *METHODS), lists):
-        raise TaskError(f"{path}{missing}")
+        is_simulator = all(hasattr(task, name) for name in ("reset", "step")) and not hasattr(task, "observe")
+        hint = f"; if it simulates in Python, did you mean python:{path}?" if is_simulator else ""
+        raise TaskError(f"{path}{missing}{hint}")
     wrong = [
         f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
         for name, type_ in ATTRIBUTES.items()
@@ -130,12 +133,12 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
         action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
         after, reward, done = jax.eval_shape(environment.step, state, action)
         shapes = {
-            "observe": (jax.eval_shape(environment.observe, state).shape, (task.observation_size,)),
-            "descriptor": (jax.eval_shape(environment.descriptor, state).shape, (len(task.descriptor_names),)),
+            "observe": (_shape("observe", environment.observe, state), (task.observation_size,)),
+            "descriptor": (_shape("descriptor", environment.descriptor, state), (len(task.descriptor_names),)),
             "the reward of step": (reward.shape, ()),
             "done of step": (done.shape, ()),
-            "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
-            "success": (jax.eval_shape(environment.success, state, jax.ShapeDtypeStruct((), bool)).shape, ()),
+            "goal_distance": (_shape("goal_distance", environment.goal_distance, state), ()),
+            "success": (_shape("success", environment.success, state, jax.ShapeDtypeStruct((), bool)), ()),
         }
     except TaskError as error:
         raise TaskError(f"{path}: {error}") from error.__cause__
@@ -149,10 +152,25 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
 
 
+def _shape(name: str, method: Callable[..., Any], *arguments: Any) -> tuple[int, ...]:
+    """Shape of the array that a method returns. Raises TaskError if it returns something else."""
+    result = jax.eval_shape(method, *arguments)
+    if not hasattr(result, "shape"):
+        raise TaskError(f"{name} returned {_shown(result)}; it must return one array")
+    return result.shape
+
+
+def _shown(result: Any) -> str:
+    """What a method has returned, in a message: the structure, since the numbers are not known while JAX traces."""
+    if result is None:
+        return "None (is a `return` missing?)"
+    return str(jax.tree.map(lambda _: "*", result)).replace("'*'", "*")
+
+
 def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     """Functions of a user's class, constructed with the task's options."""
     kind = import_named(path)
-    task = kind(**options)
+    task = construct(kind, options)
     for name in (*ATTRIBUTES, "walls", "wall_clearance", "goal", "least_reward", "final_fitness"):
         of_class, of_instance = getattr(kind, name, None), getattr(task, name, None)
         if repr(of_class) != repr(of_instance):
@@ -163,11 +181,20 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     goal_distance = getattr(task, "goal_distance", lambda state: jnp.float32(jnp.nan))
 
     def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
-        state, reward, done = task.step(state, action)
+        result = task.step(state, action)
+        try:
+            state, reward, done = result
+        except (TypeError, ValueError):
+            raise TaskError(f"step returned {_shown(result)}; it must return (state, reward, done)") from None
+        if reward is None or done is None:
+            raise TaskError(f"step returned {_shown(result)}; its reward and done must not be None")
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
     def observe(state: Any) -> Any:
-        return jnp.asarray(task.observe(state), jnp.float32)
+        observation = task.observe(state)
+        if observation is None:
+            raise TaskError(f"observe returned {_shown(None)}; it must return one array")
+        return jnp.asarray(observation, jnp.float32)
 
     def reset(key: Any) -> Any:
         try:
