@@ -30,7 +30,7 @@ from es_service.config.yaml_text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
 from es_service.protocol.system import given_path
 from es_service.runs.sweep import SweptRun, run_planned
-from es_service.runs.sweep_plan import plan
+from es_service.runs.sweep_plan import left_out_notes, plan
 from es_service.runs.trackers import check_trackers
 
 SeedsOption = Annotated[
@@ -107,6 +107,8 @@ def run_sweep(
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
     planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
     print_config_notes(config, [(run.overrides, run.config) for run in planned])
+    for note in left_out_notes(planned):
+        print_note(f"note: {note}")
     try:
         with show_sweep(console, errors, str(out)) as (show, note):
             runs = run_planned(planned, out, parallel, show, note, options)

@@ -21,9 +21,12 @@ from es_service.config.fields import TASK_OPTIONS, as_tuple
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
 from es_service.config.methods import (
+    KIND,
     Methods,
     all_search_fields,
     filled_in,
+    has_effect,
+    kinds_without,
     method_problems,
     no_effect,
     parts_of,
@@ -101,6 +104,24 @@ def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[
     values, wanted = _given(source, overrides)
     method = algorithms[{**values, **wanted}["search.algorithm"]]
     return foreign_keys(values, wanted, method.settings, algorithms)
+
+
+def idle_keys(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
+    """Keys of the overrides that the method of a config, or the chosen kind of a part, does not have; each with the
+    name of that method or kind. Nothing if `load_config` cannot read the config or does not know its method."""
+    try:
+        values, wanted = _given(source, overrides)
+        method = str({**values, **wanted}.get("search.algorithm"))
+        settings = algorithms[method].settings
+    except (KeyError, ConfigError):
+        return {}
+    chosen = filled_in({**values, **wanted}, settings) | values | wanted
+    idle = {key: method for key in wanted if not has_effect(key, settings)}
+    for key in wanted:
+        kind = f"{key.rpartition('.')[0]}.{KIND}"
+        if key not in idle and kinds_without(key, chosen.get(kind), settings):
+            idle[key] = f"{kind} = {show(chosen[kind])}"
+    return idle
 
 
 def kept(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +12,7 @@ from typing import Any
 
 from es_service.config.changes import KeptValue
 from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.loading import Source, kept
+from es_service.config.loading import Source, idle_keys, kept
 from es_service.config.model import RunConfig
 from es_service.config.problems import one_of
 from es_service.config.tasks import TASKS
@@ -40,6 +40,19 @@ class PlannedRun:
     overrides: Mapping[str, Any]
     """Every key of the config that the sweep sets."""
     config: RunConfig
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Keys that the sweep sets for other runs only -> the method, or kind of a part, of this run that lacks the key."""
+
+
+def left_out_notes(planned: Sequence[PlannedRun]) -> list[str]:
+    """A sentence for each method, or kind of a part, that names the keys which the sweep leaves out for it."""
+    keys: dict[str, dict[str, None]] = {}
+    for run in planned:
+        for key, lacks in run.left_out.items():
+            keys.setdefault(lacks, {})[key] = None
+    return [
+        f"left out {', '.join(names)} with {lacks}, since that would have no effect" for lacks, names in keys.items()
+    ]
 
 
 def plan(
@@ -54,6 +67,8 @@ def plan(
     """The runs of a sweep, the seed changing fastest, then the last key of the grid.
 
     The name of a run depends only on its own settings, so a sweep with more values or seeds has the same runs and more.
+    A key that only some of the methods (or kinds of a part) of the grid have is left out for the others, which have one
+    run for all of its values.
 
     Args:
         out: folder in which each run has a folder.
@@ -76,21 +91,34 @@ def plan(
     if problems:
         raise _refused(source, problems)
     combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
-    named = {_name(settings): settings for settings in combinations}
-    if len(named) < len(combinations):
+    idle = [idle_keys(source, {**common, **settings}, ALGORITHMS) for settings in combinations]
+    used = {
+        key
+        for settings, without in zip(combinations, idle, strict=True)
+        for key in {**common, **settings}
+        if key not in without
+    }
+    runs: dict[str, tuple[dict[str, Any], dict[str, str]]] = {}  # by their settings, since some may now be equal
+    for settings, without in zip(combinations, idle, strict=True):
+        gone = {key: lacks for key, lacks in without.items() if key in used}
+        own = {key: value for key, value in settings.items() if key not in gone}
+        runs.setdefault(in_line(own), (own, gone))
+    named = {_name(own): (own, gone) for own, gone in runs.values()}
+    if len(named) < len(runs):
         what = "two combinations of these values give folders with the same name; use a sweep for each"
         raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
     planned: list[PlannedRun] = []
     wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
     stays: dict[str, list[KeptValue]] = {}
-    for name, settings in named.items():
-        wanted, folder = {**common, **settings}, out / name
+    for name, (settings, gone) in named.items():
+        wanted = {key: value for key, value in common.items() if key not in gone} | settings
+        folder = out / name
         try:
             for key, value in kept(source, wanted, tasks=TASKS, algorithms=ALGORITHMS).items():
                 if len(grid.get(value.replaced, ())) > 1:
                     stays.setdefault(key, []).append(value)
             new = here and not holds_run(folder)
-            planned.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new)))
+            planned.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new), gone))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}

@@ -78,7 +78,7 @@ def test_a_key_without_effect_is_refused_with_the_methods_that_have_it():
 
 
 def test_each_value_of_a_sweep_is_checked(tmp_path):
-    grid = {"search.algorithm": ["es", "map_elites"], "search.sigma": [0.02, 0.3]}
+    grid = {"search.algorithm": ["map_elites"], "search.sigma": [0.02, 0.3]}
     with pytest.raises(ConfigError) as caught:
         plan(MINIMAL, tmp_path, grid, range(2))
     found = [(problem.field, problem.value, problem.suggestion) for problem in caught.value.problems]

@@ -22,7 +22,7 @@ from es_service.errors import ConfigError
 from es_service.runs import sweep_cores
 from es_service.runs.sweep import INSIDE, SweptRun, sweep
 from es_service.runs.sweep_cores import divide, share
-from es_service.runs.sweep_plan import plan
+from es_service.runs.sweep_plan import left_out_notes, plan
 from tests.es_service.config_examples import MINIMAL
 from tests.run_examples import write_run
 
@@ -52,6 +52,30 @@ def test_a_larger_sweep_has_the_runs_of_the_smaller_one(tmp_path):
     small = plan(MINIMAL, tmp_path, {"search.sigma": [0.1]}, [1])
     large = plan(MINIMAL, tmp_path, {"search.sigma": [0.05, 0.1]}, range(3))
     assert all(run in large for run in small)
+
+
+def test_a_key_that_only_some_methods_of_a_sweep_have_is_left_out_for_the_others(tmp_path):
+    grid = {"search.algorithm": ["me_es", "map_elites", "ns_es"]}
+    shared = ["search.sigma=0.1", "search.pairs=32", "search.step.learning_rate=0.1", "search.step.l2=0"]
+    runs = plan("point_maze_me_es", tmp_path, grid, None, [*shared, "search.evaluation_episodes=30"])
+    assert [run.name for run in runs] == ["algorithm=me_es", "algorithm=map_elites", "algorithm=ns_es"]
+    assert [run.overrides.get("search.sigma") for run in runs] == [0.1, None, 0.1]
+    keys = ", ".join(word.partition("=")[0] for word in shared)
+    assert left_out_notes(runs) == [f"left out {keys} with map_elites, since that would have no effect"]
+    several = plan(MINIMAL, tmp_path, {"search.algorithm": ["es", "map_elites"], "search.sigma": [0.05, 0.1]}, range(2))
+    names = ["algorithm=map_elites_seed=0", "algorithm=map_elites_seed=1"]
+    assert [run.name for run in several[4:]] == names
+    assert plan(MINIMAL, tmp_path, {"search.algorithm": ["es", "memes"]}, None, ["search.emitters=4"])
+    kinds = {"search.step.kind": ["adam", "clipup"]}
+    stepping = plan(MINIMAL, tmp_path, kinds, None, ["search.step.max_speed=0.3"])
+    assert [run.overrides.get("search.step.max_speed") for run in stepping] == [None, 0.3]
+    assert left_out_notes(stepping) == [
+        "left out search.step.max_speed with search.step.kind = adam, since that would have no effect"
+    ]
+    with pytest.raises(ConfigError, match=r"search\.batch: 3 has no effect with es"):
+        plan(MINIMAL, tmp_path, {"search.algorithm": ["es", "ns_es"]}, None, ["search.batch=3"])
+    with pytest.raises(ConfigError, match=r"search\.typo"):
+        plan(MINIMAL, tmp_path, grid, None, ["search.typo=3"])
 
 
 def test_all_problems_of_all_runs_are_one_message(tmp_path):
