@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
@@ -109,6 +109,11 @@ def make_training_rollout(
             episodes = kernel.run(weights, *given) if elsewhere is None else elsewhere(kernel, centre_D, *given)
             by_episode.append(with_faults(episodes, lambda lane_M, keys_L=keys_L: again(lane_M, *keys_L), pairs=True))
         axes = (len(noise_keys_P), 2, spec.episodes_per_member)
+        if any(episodes.fault is not None for episodes in by_episode):  # then all have some, to be put together
+            nothing = _no_faults(2 * len(noise_keys_P))
+            by_episode = [
+                episodes._replace(fault=nothing) if episodes.fault is None else episodes for episodes in by_episode
+            ]
         if len(by_episode) == 1:
             return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), by_episode[0])
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]), *by_episode)
@@ -201,7 +206,7 @@ def _with_faults(
     pairs: bool = False,
     allow_infeasible: bool = False,
 ) -> Episodes:
-    """Episodes [L] with `Episodes.fault`.
+    """Episodes [L] with `Episodes.fault`, which is None if no result calls for a look.
 
     To look for faults would cost small policies some percent of their speed. A kernel only leaves a trace of them, a
     result that is not finite, for other reasons too. Episodes with such a result run again.
@@ -212,23 +217,27 @@ def _with_faults(
         pairs: whether neighbouring lanes can only run together.
         allow_infeasible: whether a fitness of -inf alone is no reason to look.
     """
+    results = (episodes.fitness, episodes.returns, episodes.descriptor)
+    sums = (episodes.shifted_sum_O, episodes.shifted_square_sum_O)
+    if all(np.isfinite(array).all() for array in (*results, *sums)):
+        return episodes
 
-    def not_finite(*arrays: np.ndarray) -> np.ndarray:
+    def not_finite(arrays: Sequence[np.ndarray]) -> np.ndarray:
         rows = [array.reshape(len(episodes.steps), -1) for array in arrays]
         return ~np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows])
 
-    is_suspect_L = not_finite(episodes.fitness, episodes.returns, episodes.descriptor)
+    is_suspect_L = not_finite(results)
     if allow_infeasible:
         is_suspect_L &= episodes.fitness != -np.inf
-    is_suspect_L |= not_finite(episodes.shifted_sum_O, episodes.shifted_square_sum_O)
+    is_suspect_L |= not_finite(sums)
     if wanted_L is not None:
         is_suspect_L &= wanted_L
     if pairs:
         is_suspect_L = is_suspect_L.reshape(-1, 2).any(axis=1).repeat(2)
-    episodes = episodes._replace(fault=np.tile(np.array([0, NO_FAULT], np.int32), (len(is_suspect_L), 1)))
     lane_M = np.flatnonzero(is_suspect_L)
     if not lane_M.size:
         return episodes
+    episodes = episodes._replace(fault=_no_faults(len(is_suspect_L)))
 
     def put(array_L: np.ndarray, array_M: np.ndarray) -> np.ndarray:
         array_L = array_L.copy()
@@ -236,6 +245,11 @@ def _with_faults(
         return array_L
 
     return jax.tree.map(put, episodes, again(lane_M))
+
+
+def _no_faults(lanes: int) -> np.ndarray:
+    """`Episodes.fault` [L, 2] of episodes without one."""
+    return np.tile(np.array([0, NO_FAULT], np.int32), (lanes, 1))
 
 
 class _Kernels:
