@@ -35,6 +35,7 @@ def write_run(
     task: TaskSpec = SHIPPED["point_maze"],
     generations: int = 20,
     filled: float = 0.5,
+    invalid: int = 0,
     parent: dict[str, Any] | None = None,
 ) -> Path:
     """Write a run of one centre after some generations; every value follows from the arguments and the seed.
@@ -42,6 +43,7 @@ def write_run(
     Args:
         settings: dotted config keys.
         filled: share of the map's cells that have an elite.
+        invalid: number of invalid members of the newest generation.
         parent: `RunMeta.parent`.
     """
     source = {"task.environment": task.name, "search.algorithm": "me_es", "budget.generations": generations or 1}
@@ -64,6 +66,7 @@ def write_run(
     fitness_G = -100.0 + 80.0 * (1 - np.exp(-np.arange(generations + 1) / 40)) + rng.normal(size=generations + 1)
     best = int(fitness_G.argmax())
     rows = [_row(task, g, fitness_G, descriptor_G_B[g], map_) for g in range(generations + 1)]
+    rows[-1]["invalid_members"] = invalid
     centre_D = rng.normal(size=shape.parameters).astype(np.float32)
     size = task.observation_size
     nothing_O, ones_O = np.zeros(size, np.float32), np.ones(size, np.float32)

@@ -15,6 +15,7 @@ from es_service.report.series import phase_seconds
 from es_service.runs.certified import measure_of, tries_sentence
 from es_service.runs.identity import code_changes
 from es_service.runs.objectives import objectives, weights
+from es_service.runs.recent import invalid_members
 from es_service.runs.run_status import population_size, state
 
 
@@ -84,6 +85,7 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
                 f"{data.last('env_steps'):,.0f}{of.get('env_steps', '')} in {data.last('episodes'):,.0f} episodes",
             ),
             *_objectives(data),
+            *_invalid(data),
             ("time", f"{duration(data.last('wall_clock_s'))} on {counted(int(data.last('workers')), 'worker')}"),
         ]
     if data.meta.parent:
@@ -99,6 +101,14 @@ def _objectives(data: RunData) -> list[tuple[str, str]]:
         return []
     exploring, exploiting = (f"{100 * part / counts.centres:.1f} %" for part in (counts.exploring, counts.exploiting))
     return [("centres", f"{exploring} of {counts.centres:,} explored, {exploiting} exploited")]
+
+
+def _invalid(data: RunData) -> list[tuple[str, str]]:
+    """How many members of the newest generations were invalid, as (label, text), if any was."""
+    is_newest_N = data.centres["generation"] == data.last("generation")
+    moved = int(np.isfinite(data.centres["update_norm"][is_newest_N]).sum())
+    invalid = invalid_members(data.constants, data.history["invalid_members"].tolist(), moved, int(is_newest_N.sum()))
+    return [("invalid members", invalid)] if invalid else []
 
 
 def provenance(data: RunData) -> list[tuple[str, str]]:

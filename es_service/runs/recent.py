@@ -5,7 +5,9 @@ This is read from many rows of the history. So that a damaged one hides nothing 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +32,8 @@ class Recent:
     """What the centres of recent generations climb, the newest included."""
     lost_workers: int = 0
     retries: int = 0
+    invalid_members: str = ""
+    """What `invalid_members` returns for these generations."""
     problem: str | None = None
     """Why nothing is known, such as a damaged row."""
 
@@ -37,17 +41,40 @@ class Recent:
 def read_recent(run: Run, generation: int) -> Recent:
     """What happened in a run up to a generation, its newest."""
     try:
-        newest, recent = _objectives(run, generation)
+        newest, recent, evaluated = _objectives(run, generation)
         rows = run.history_rows(generation - FAULTS_OF + 1)
     except StoreError as error:
         return Recent(problem=error.sentence)
     # A fork may have no numbers (NaN) for the generations of its parent.
     lost, retries = (sum(row[name] for row in rows if row[name] > 0) for name in ("lost_workers", "retries"))
-    return Recent(newest, recent, lost, retries)
+    invalid = invalid_members(run.constants, [row["invalid_members"] for row in rows], newest.centres, evaluated)
+    return Recent(newest, recent, lost, retries, invalid)
 
 
-def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives]:
-    """What the centres of a generation climb, and those of recent generations, this one included."""
+def invalid_members(constants: Mapping[str, Any], invalid_G: Sequence[float], moved: int, evaluated: int) -> str:
+    """How many members of the newest generations were invalid, in words such as "26 % of the last generation"; empty if
+    there was none.
+
+    Args:
+        constants: those of the run.
+        invalid_G: invalid members of the generations, the newest last; NaN where it is not known.
+        moved: centres of the newest generation that a population has moved.
+        evaluated: centres and policies of the newest generation.
+    """
+    recent = [int(invalid) for invalid in invalid_G[-FAULTS_OF:] if invalid > 0]
+    if not recent:
+        return ""
+    last, members = invalid_G[-1], 2 * constants.get("search.pairs", 0) * moved
+    if not last > 0:
+        return f"none in the last generation, {sum(recent):,} in the last {min(len(invalid_G), FAULTS_OF):,}"
+    if moved != evaluated or members < last:  # the number of members is not stored
+        return f"{int(last):,} in the last generation"
+    return f"{100 * last / members:.3g} % of the last generation"
+
+
+def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives, int]:
+    """What the centres of a generation climb, those of recent generations, this one included, and how many centres and
+    policies the generation evaluated."""
     [newest] = read_evaluations(run.folder, generation, 1) or [[]]  # a driver that falls back may have deleted it
     count = min(generation + 1, max(1, CENTRES // max(1, len(newest))))
     recent = read_evaluations(run.folder, generation + 1 - count, count)
@@ -55,4 +82,4 @@ def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives]:
         np.array([centre["fitness_weight"] for centre in centres if np.isfinite(centre["update_norm"])])
         for centres in (newest, [centre for each in recent for centre in each])
     )
-    return objectives(of_generation), objectives(of_all)
+    return objectives(of_generation), objectives(of_all), len(newest)

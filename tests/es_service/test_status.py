@@ -23,6 +23,8 @@ from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
+from es_service.report.data import read_run
+from es_service.report.facts import what_was_run
 from es_service.runs import recent
 from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader
@@ -68,6 +70,34 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
             monkeypatch.setattr(module, "FAULTS_OF", most)
         print_status(console, run)
         assert re.findall("\nfaults .*\n", capsys.readouterr().out) == expected
+
+
+@pytest.mark.parametrize("invalid", [0, 52])
+def test_the_share_of_invalid_members_is_said_after_the_run_if_there_were_any(console, tmp_path, capsys, invalid):
+    run = api.open_run(write_run(tmp_path / "run", {"search.pairs": 100}, invalid=invalid))
+    print_status(console, run)
+    print_summary(console, run, "")
+    expected = "26 % of the last generation"
+    lines = re.findall("\ninvalid members +(.*)\n", capsys.readouterr().out)
+    assert lines == [expected] * 2 * bool(invalid)
+    assert dict(what_was_run(read_run(run.folder))).get("invalid members") == (expected if invalid else None)
+
+
+@pytest.mark.parametrize(
+    ("invalid_G", "moved", "evaluated", "expected"),
+    [
+        ([0, 7, 3], 2, 2, "1.5 % of the last generation"),
+        ([float("nan"), 0, 1], 2, 2, "0.5 % of the last generation"),
+        ([200], 2, 2, "100 % of the last generation"),
+        ([0, 7, 0], 2, 2, "none in the last generation, 7 in the last 3"),
+        ([0, 7, 3], 0, 5, "3 in the last generation"),  # policies, which are no population
+        ([0, 7, 3], 1, 2, "3 in the last generation"),
+        ([0, 0, 0], 2, 2, ""),
+        ([], 0, 0, ""),
+    ],
+)
+def test_invalid_members_are_a_share_where_the_number_of_members_is_known(invalid_G, moved, evaluated, expected):
+    assert recent.invalid_members({"search.pairs": 50}, invalid_G, moved, evaluated) == expected
 
 
 @pytest.mark.parametrize(

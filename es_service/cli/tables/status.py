@@ -171,14 +171,16 @@ def _certified(run: Run) -> dict[str, str]:
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:
-    """The faults of recent generations, if there are any; or why they and the objectives are not known."""
+    """The invalid members and the faults of recent generations, if there are any; or why they and the objectives are
+    not known."""
     if recent.problem:
         return {"not known": f"objectives and faults of the recent generations: {recent.problem}"}
+    invalid = {"invalid members": recent.invalid_members} if recent.invalid_members else {}
     if not recent.lost_workers and not recent.retries:
-        return {}
+        return invalid
     where = f" in the last {FAULTS_OF:,} generations" if generation >= FAULTS_OF else ""
     faults = f"{counted(recent.lost_workers, 'worker')} replaced, {counted(recent.retries, 'chunk')} sent again"
-    return {"faults handled": f"{faults}{where}"}
+    return invalid | {"faults handled": f"{faults}{where}"}
 
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:
