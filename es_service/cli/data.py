@@ -24,7 +24,8 @@ def print_json(value: object) -> None:
 
 def status_data(status: RunStatus) -> dict[str, Any]:
     """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
-    that generation climb, and those of recent ones, or in `problem` why that is not known."""
+    that generation climb, and those of recent ones, or in `problem` why that is not known; `tries` has the mean fitness
+    of each policy that did not reach `target_certified` in new episodes."""
     run, row = status.run, status.row
     recent = read_recent(run, row["generation"]) if row else Recent()
     return {
@@ -37,6 +38,8 @@ def status_data(status: RunStatus) -> dict[str, Any]:
         "driver": status.driver,
         "last_end": status.end,
         "limits": status.limits,
+        "target_certified": status.target_certified,
+        "tries": status.tries,
         "newest": row,
         "objectives": {
             "newest": recent.newest and recent.newest._asdict(),

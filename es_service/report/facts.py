@@ -12,7 +12,7 @@ from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
-from es_service.runs.certified import measure_of, tries_sentence
+from es_service.runs.certified import failed_sentence, measure_of, tries_sentence
 from es_service.runs.identity import code_changes
 from es_service.runs.objectives import objectives, weights
 from es_service.runs.recent import invalid_members
@@ -86,6 +86,7 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
             ),
             *_objectives(data),
             *_invalid(data),
+            *_target(data),
             ("time", f"{duration(data.last('wall_clock_s'))} on {counted(int(data.last('workers')), 'worker')}"),
         ]
     if data.meta.parent:
@@ -109,6 +110,14 @@ def _invalid(data: RunData) -> list[tuple[str, str]]:
     moved = int(np.isfinite(data.centres["update_norm"][is_newest_N]).sum())
     invalid = invalid_members(data.constants, data.history["invalid_members"].tolist(), moved, int(is_newest_N.sum()))
     return [("invalid members", invalid)] if invalid else []
+
+
+def _target(data: RunData) -> list[tuple[str, str]]:
+    """The certified target with the tries that did not reach it, as (label, text), if there is one."""
+    target = data.status.target_certified
+    if target is None:
+        return []
+    return [("certified target", "; ".join(filter(None, [f"{target:g}", failed_sentence(data.status.tries)])))]
 
 
 def provenance(data: RunData) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ Axes: E episodes, D policy parameters, O observation, B descriptor dimensions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
@@ -28,6 +28,8 @@ from es_service.store.reader import read_certifications, read_meta
 
 EPISODES = 256
 """Certification episodes of a policy, unless a call says otherwise; and the episodes of a decision."""
+SHOWN_TRIES = 10
+"""Most decisions whose values a sentence shows."""
 BELOW = 0.1
 """Standard deviations below a target of the policies by which it is said how easily a decision is lucky."""
 Measure = Literal["return", "last_reward", "success", "goal_distance"]
@@ -215,6 +217,21 @@ def target_reached(folder: Path, target: float | None, fitness: str) -> str:
     below = ", below the target" if value < target else ""
     tries = f"try {report.tries:,} so far, with any target"
     return f"{what} ({tries}), and {value:.6g} in {report.episodes.count} further certified ones{below}"
+
+
+def failed_tries(policies: Iterable[Certified], target: float | None, fitness: str) -> list[float]:
+    """Mean fitness of each decision of a run that has not reached a target, in order; empty without one."""
+    means = [one.episodes.mean_fitness(fitness) for one in decisions(policies)]
+    return [] if target is None else [mean for mean in means if not mean >= target]
+
+
+def failed_sentence(means: Sequence[float]) -> str:
+    """What `failed_tries` returns in words, such as "2 tries, none held: -127.03, -127.06"; empty if it is empty."""
+    if not means:
+        return ""
+    shown = ", ".join(f"{mean:.2f}" for mean in means[-SHOWN_TRIES:])
+    newest = f" (the newest {SHOWN_TRIES})" if len(means) > SHOWN_TRIES else ""
+    return f"1 try, did not hold: {shown}" if len(means) == 1 else f"{len(means):,} tries, none held: {shown}{newest}"
 
 
 def tries_sentence(tries: int) -> str:

@@ -14,7 +14,7 @@ from es_service.config.model import BudgetConfig
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import MOST_DURATIONS, REACHED, durations, limits_of, only_started, raised, spent
 from es_service.loop.history import Row
-from es_service.runs.certified import target_reached
+from es_service.runs.certified import all_certifications, failed_tries, target_reached
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG, DATABASE, runs_inside
 from es_service.store.lock import last_end, lock_holder
@@ -39,6 +39,10 @@ class RunStatus:
     """Why the budget cannot be read; empty if it can."""
     certified: str = ""
     """Why the run is over by `budget.target_certified`; empty if it is not."""
+    target_certified: float | None = None
+    """`budget.target_certified`; None if it is not set, or if the budget cannot be read."""
+    tries: tuple[float, ...] = ()
+    """Mean fitness of each policy that did not reach it in new episodes, in order."""
     end: str = ""
     """How the last session ended, in words, if there is no driver; empty if it is not known."""
     durations: tuple[float, ...] = ()
@@ -85,13 +89,17 @@ def status_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Ru
         first = error.errors()[0]
         key = ".".join(map(str, ("budget", *first["loc"])))
         return RunStatus(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
+    target, fitness = budget.target_certified, run.meta.config["task"]["fitness"]
+    certified, tries = "", ()
     try:
-        certified = target_reached(run.folder, budget.target_certified, run.meta.config["task"]["fitness"])
+        if target is not None:
+            certified = target_reached(run.folder, target, fitness)
+            tries = tuple(failed_tries(all_certifications(run.folder), target, fitness))
     except StoreError:
-        certified = ""  # damage of a certification, which `verify` names
+        pass  # damage of a certification, which `verify` names
     end, limits = "" if driver else last_end(run.folder), limits_of(budget)
     recent = recent_durations(run.folder, limits, row)
-    return RunStatus(run, driver, row, limits, certified=certified, end=end, durations=recent)
+    return RunStatus(run, driver, row, limits, "", certified, target, tries, end, recent)
 
 
 def recent_durations(folder: Path, limits: Mapping[str, float], row: Row | None) -> tuple[float, ...]:

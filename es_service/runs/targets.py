@@ -57,6 +57,13 @@ def certify_best(folder: Path, config: RunConfig, on_notice: Callable[[str], Non
         policies, number = all_certifications(folder), store.next_certification
         for one in attempt(policies, best, number, target, config.task.fitness, platform_of(local), episodes_of):
             add_certified(store, [one], on_notice)
+            mean = one.episodes.mean_fitness(config.task.fitness)
+            if one.decides and not mean >= target:
+                on_notice(
+                    f"the best centre, of generation {one.generation}, does not reach budget.target_certified = "
+                    f"{target:g} in {one.episodes.count} new episodes: {mean:.6g}; "
+                    "the run continues unless its budget is spent"
+                )
 
 
 def attempt(

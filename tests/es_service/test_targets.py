@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from es_service import api
+from es_service.cli.console import text_console
+from es_service.cli.data import status_data
+from es_service.cli.tables.status import print_status, print_summary
 from es_service.protocol.noise import Domain
+from es_service.report.data import read_run
+from es_service.report.facts import what_was_run
 from es_service.runs import run_status, targets
 from es_service.runs.certification import Named, certify_run
 from es_service.runs.certified import (
@@ -18,6 +23,7 @@ from es_service.runs.certified import (
     Episodes,
     all_certifications,
     certified_policies,
+    failed_sentence,
     target_reached,
     tries_sentence,
 )
@@ -79,15 +85,36 @@ def test_it_ends_at_the_first_best_centre_that_new_episodes_confirm_and_its_bits
     assert further.run.digest() == whole.digest()
 
 
-def test_lucky_evaluations_do_not_end_a_run(whole, tmp_path):
-    target = float(np.quantile(whole.history["best_fitness"], 0.4))
-    outcome = api.run(api.load_config(CONFIG, [f"budget.target_certified={target}"]), tmp_path / "run")
+def test_lucky_evaluations_do_not_end_a_run_and_each_failed_try_is_said(whole, tmp_path, capsys):
+    target, notices = float(np.quantile(whole.history["best_fitness"], 0.4)), []
+    config = api.load_config(CONFIG, [f"budget.target_certified={target}"])
+    outcome = api.run(config, tmp_path / "run", on_notice=notices.append)
     tested = decided(tmp_path / "run")
     assert len(tested) > 1
     assert certified_policies(tmp_path / "run") == []
     assert all(one.row()["return_mean"] < target <= one.stored_fitness for one in tested)
     assert outcome.reason == "the budget of 40 generations is spent"
     assert outcome.run.digest() == whole.digest()
+    said = [notice for notice in notices if f"does not reach budget.target_certified = {target:g} in 256" in notice]
+    means = [one.row()["return_mean"] for one in tested]
+    assert [f": {mean:.6g};" in notice for mean, notice in zip(means, said, strict=True)] == [True] * len(tested)
+    told = run_status.read_status(outcome.run)
+    given = status_data(told)
+    assert (given["target_certified"], list(given["tries"])) == (target, means)
+    sentence = f"{len(tested)} tries, none held: {', '.join(f'{mean:.2f}' for mean in means)}"
+    print_status(text_console(), outcome.run)
+    print_summary(text_console(), outcome.run, "")
+    shown = capsys.readouterr().out
+    assert shown.count(f" (certified target: {target:g}); selected, not certified\n") == 2
+    assert shown.count(f"\ncertified target   {sentence}\n") == 2
+    assert dict(what_was_run(read_run(outcome.run.folder)))["certified target"] == f"{target:g}; {sentence}"
+
+
+def test_tries_that_hold_are_no_failed_ones_and_only_the_newest_are_shown():
+    assert failed_sentence([]) == ""
+    assert failed_sentence([-1.5]) == "1 try, did not hold: -1.50"
+    assert failed_sentence([float(i) for i in range(12)]).startswith("12 tries, none held: 2.00, 3.00, ")
+    assert failed_sentence([float(i) for i in range(12)]).endswith(", 11.00 (the newest 10)")
 
 
 def test_a_run_that_was_interrupted_before_its_certification_begins_with_it(whole, tmp_path, monkeypatch):
@@ -157,7 +184,7 @@ def test_a_policy_that_passes_a_lower_target_than_it_was_tried_with_is_certified
 
 def fail_one_try(folder, best):
     """The decision of a run whose target is the fitness of its best centre, which it does not reach."""
-    outcome = api.resume(folder, {"budget.target_certified": best})
+    outcome = api.resume(folder, {"budget.target_certified": best}, on_notice=lambda notice: None)
     assert outcome.reason == "the budget of 1 generation is spent"
     return decided(folder)
 

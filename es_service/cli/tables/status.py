@@ -12,7 +12,7 @@ from es_service.cli.tables.certified import certified_line
 from es_service.errors import StoreError, counted
 from es_service.loop.history import evaluated_nouns
 from es_service.report.progress import plain_line
-from es_service.runs.certified import newest_certified
+from es_service.runs.certified import failed_sentence, newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.run_status import (
     RunStatus,
@@ -113,9 +113,12 @@ def _progress(status: RunStatus) -> dict[str, str]:
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
     steps = f"{last['env_steps']:,}{of.get('env_steps', '')}"
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
+    if status.target_certified is not None:
+        target += f" (certified target: {status.target_certified:g})"
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
         "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
+        **({"certified target": failed_sentence(status.tries)} if status.tries else {}),
         f"{nouns[0]} fitness": f"{last['centre_fitness_mean']:.2f}{spread}",
         **goal,
         **filled,
