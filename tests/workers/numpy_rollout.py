@@ -166,8 +166,8 @@ def episode(
 
 def stacked(episodes: Sequence[Episodes]) -> Episodes:
     """Episodes along a new first axis."""
-    arrays = (np.stack(arrays) for arrays in zip(*(one[:-3] for one in episodes), strict=True))
+    arrays = (np.stack(arrays) for arrays in zip(*(one[:-4] for one in episodes), strict=True))
     named = (
-        {name: np.stack([one[field][name] for one in episodes]) for name in episodes[0][field]} for field in (-3, -2)
+        {name: np.stack([one[field][name] for one in episodes]) for name in episodes[0][field]} for field in (-4, -3)
     )
-    return Episodes._make([*arrays, *named, ()])
+    return Episodes._make([*arrays, *named, None, ()])
