@@ -35,10 +35,10 @@ class RunState:
     episodes: int
     wall_clock_s: float
     """Seconds spent so far in all sessions. They are stored only in the history, because they are not deterministic."""
-    durations: tuple[float, ...] = ()
-    """`budget.durations` of the newest generations."""
     elites: Mapping[int, Elite] = field(default_factory=dict)
     """Policies of elites that entered the map in this generation, by cell; the others are only in the store."""
+    durations: tuple[float, ...] = ()
+    """`budget.durations` of the newest generations."""
 
 
 def statistics_in_force(
