@@ -22,7 +22,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 def test_an_export_without_its_package_says_how_to_get_it(tmp_path, monkeypatch, to, package):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr(export, "tables", lambda run: [("history", pd.DataFrame({"generation": [0]}))])
-    run = SimpleNamespace(generation=0)
+    run = SimpleNamespace(generation=0, folder=tmp_path / "run")
     with pytest.raises(ConfigError, match=f"needs py{package.removeprefix('py').partition('.')[0]}") as error:
         export.export(run, to, tmp_path)
     assert (error.value.field, error.value.value) == ("to", to)

@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
@@ -89,7 +90,9 @@ class Threads(inline_module.ChildProcesses):
         log, control = tempfile.TemporaryFile(), socket.socket()  # noqa: SIM115
         child = inline_module._Child(subprocess.Popen(["sleep", "60"]), log, control)
         ours, theirs = inline_module._socket_pair()
-        given = theirs.detach(), COMPUTING, self.theirs
+        computing: Future[Any] = Future()
+        computing.set_result(COMPUTING)
+        given = theirs.detach(), computing, self.theirs
         threading.Thread(target=process._work, args=given, daemon=True).start()
         self._add(worker, child, ours)
         self._ready.append(Placed(worker))
