@@ -28,7 +28,7 @@ from es_service.protocol.messages import Chunk
 from es_service.runs import compiling, evaluation, session
 from es_service.runs.compiling import compiling_sentence, note_compiled, was_compiled
 from es_service.runs.run_status import doing, read_status
-from tests.helpers import spec
+from tests.helpers import spec, workers_in_this_process
 from tests.system.session import SMALL
 
 KINDS = ("EvaluationChunk", "TrainingChunk")
@@ -110,16 +110,16 @@ def test_every_kind_of_chunk_has_words():
     assert {kind.__name__ for kind in Chunk.__args__} == set(compiling.CONTENTS)
 
 
-@pytest.mark.usefixtures("workers_here")
 def test_a_run_says_how_long_it_places_centroids_and_a_resumed_one_has_them(tmp_path, monkeypatch):
     monkeypatch.setattr(session, "LONG_PLACING_S", 0.0)
     config, said = SMALL | {"map": {"kind": "cvt", "cells": [9]}, "budget": {"generations": 1}}, []
-    api.run(config, tmp_path / "run", on_compile=said.append)
-    sentence = "placing the centroids of the map (9 cells in 2 dimensions, about 0 s)"
-    assert [one for one in said if "centroids" in one] == [sentence]
-    api.resume(tmp_path / "run", ["budget.generations=2"], on_compile=said.append)
-    api.run(config | {"map": {"cells": [3, 3]}}, tmp_path / "grid", on_compile=said.append)
-    assert [one for one in said if "centroids" in one] == [sentence]
+    with workers_in_this_process():  # in this test alone
+        api.run(config, tmp_path / "run", on_compile=said.append)
+        sentence = "placing the centroids of the map (9 cells in 2 dimensions, about 0 s)"
+        assert [one for one in said if "centroids" in one] == [sentence]
+        api.resume(tmp_path / "run", ["budget.generations=2"], on_compile=said.append)
+        api.run(config | {"map": {"cells": [3, 3]}}, tmp_path / "grid", on_compile=said.append)
+        assert [one for one in said if "centroids" in one] == [sentence]
 
 
 @pytest.mark.slow

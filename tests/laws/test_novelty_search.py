@@ -277,7 +277,7 @@ def test_invalid_members_are_last_whatever_is_climbed(weight, shaping):
     fitness = np.array([[1.0, np.nan], [9.0, 2.0]], np.float32)
     descriptor = np.array([[(1.0, 0.0), (50.0, 0.0)], [(np.inf, 0.0), (2.0, 0.0)]], np.float32)
     population = EpisodesResult(fitness, fitness, descriptor, np.ones((2, 2), np.int32), fitness, no_observations(2))
-    (population,) = invalidate([population], 0.5, 1)
+    (population,), _ = invalidate([population], config_of("nsr_es").search, 1)
     assert np.isnan(population.fitness).sum() == 2
     state = add_to_archive(
         first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2))
