@@ -139,6 +139,9 @@ class Mirror:
     def place(self) -> WorkerPlace:
         return WorkerPlace("host", os.getpid(), "node")
 
+    def progress(self) -> tuple[int, str, int, int]:
+        return 0, "", 0, 0
+
     def build(self) -> str:
         return "a mirror's"
 
