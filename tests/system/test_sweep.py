@@ -111,7 +111,9 @@ def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path)
         printed, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted; every finished generation of every run is saved" in errors
-    assert [line.split()[:2] for line in printed.splitlines()[-2:]] == [[name, "stopped"] for name in names]
+    *ends, last = printed.splitlines()[-3:]
+    assert [line.split()[:2] for line in ends] == [[name, "stopped"] for name in names]
+    assert last == "2 runs: 2 stopped"
     assert started
     assert not any(map(is_running, started))
     for name in names:
