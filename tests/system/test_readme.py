@@ -177,8 +177,11 @@ def test_every_attribute_that_a_task_may_have_is_explained():
     folder = ROOT / "workers" / "environments"
     _, docstring, code = (folder / "user_task.py").read_text().split('"""', 2)
     code += (folder / "declared.py").read_text()
-    known = {*re.findall(r'(?:getattr|hasattr)\(task, "([a-z]\w*)"', code), "options"}  # `declared_options` reads the latter
-    known -= {"observe"}  # which every class must have
+    read = {
+        *re.findall(r'(?:getattr|hasattr)\(task, "([a-z]\w*)"', code),
+        "options",
+    }  # `declared_options` reads the latter
+    known = read - {"observe"}  # which every class must have
     table = TEXT["workers/README.md"].partition("A class may also have:")[2].strip().partition("\n\n")[0]
     rows = {name for row in table.splitlines() for name in re.findall(r"`(\w+)[^`]*`", row.partition(" | ")[0])}
     assert known == rows
