@@ -188,6 +188,31 @@ def loops(draw: Draw) -> Case:
     ]
 
 
+def loops_by_data(draw: Draw) -> Case:
+    """Loops whose ends depend on data: also with a bound, inside of others, of branches and of lanes of their own."""
+    most, bound = draw(st.floats(2.0, 9.0)), draw(st.integers(1, 30))
+
+    def grown(x):
+        return lax.while_loop(lambda y: jnp.abs(y).sum() < most, lambda y: y * 1.25 + jnp.sign(y) * 0.01, x + 0.1)
+
+    def bounded(x):
+        end = lax.while_loop(
+            lambda c: (c[0] < bound) & (c[1].sum() < most), lambda c: (c[0] + 1, c[1] + grown(c[1] * 0.3)), (0, x)
+        )
+        return *end, lax.cond(x[0] > 0, grown, lambda x: -x, x)
+
+    def scanned(x):
+        def trip(carry, _):
+            y, going = carry
+            after = lax.cond(going, lambda y: (y * 1.1 + 0.05, (y * 1.1).sum() < most), lambda y: (y, False), y)
+            return after, None
+
+        return lax.scan(trip, (x, x[0] > -1.0), None, length=bound)[0]
+
+    which = draw(st.sampled_from([grown, bounded, scanned, jax.vmap(grown), jax.vmap(bounded)]))
+    return which, [floats(draw, (2, 2) if which not in (grown, bounded, scanned) else (2,))]
+
+
 def conversions(draw: Draw) -> Case:
     source = draw(st.sampled_from(["float32", "int32", "uint32", "bool"]))
     target = draw(st.sampled_from(["float32", "int32", "bool"]))
@@ -328,6 +353,7 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "branches": branches,
     "scans": scans,
     "loops": loops,
+    "loops by data": loops_by_data,
     "conversions": conversions,
     "compares": compares,
     "boolean compares": binary(lambda a, b: (a == b, a != b), booleans),

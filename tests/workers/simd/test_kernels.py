@@ -6,6 +6,7 @@ import ctypes
 import functools
 import platform
 import threading
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,8 @@ def test_operations_are_the_references_for_special_values_too(target: Target) ->
             a == b, a != b, a < b, a <= b, jnp.where(a < b, a, c), a * b + c, c - a * b, a * b - c,
             i + j, i - j, i * j, i & j, i | j, i ^ j, i << 3, i >> 3, lax.shift_right_logical(i, 3), i == j, i < j,
             i.astype(jnp.float32), lax.bitcast_convert_type(i, jnp.uint32).astype(jnp.float32), (a < b) ^ (b < c),
-            lax.population_count(i), jnp.where(a < b, i, j), lax.bitcast_convert_type(i, jnp.float32),
+            lax.population_count(i), jnp.where(a < b, i, j), jnp.where(a < b, b < c, i < j),
+            lax.bitcast_convert_type(i, jnp.float32),
             lax.div(i, j), lax.rem(i, j), *(divide(*(lax.bitcast_convert_type(x, jnp.uint32) for x in (i, j)))
                                             for divide in (lax.div, lax.rem)),
         )  # fmt: skip
@@ -103,13 +105,19 @@ def test_operations_are_the_references_for_special_values_too(target: Target) ->
         np.testing.assert_array_equal(one, np.asarray(other).astype(one.dtype))
 
 
+def halved(x):
+    """As many halvings as a number needs to become small."""
+    return lax.while_loop(lambda x: jnp.abs(x).max() > 0.01, lambda x: x * 0.5 - 1e-4 * jnp.sin(x[::-1]), x)
+
+
 def swing(x):
     return lax.fori_loop(0, 500, lambda _, x: x - 0.01 * jnp.sin(x[::-1]), x)
 
 
-def test_a_lane_does_not_know_its_neighbours() -> None:
+@pytest.mark.parametrize("function", [swing, halved])
+def test_a_lane_does_not_know_its_neighbours(function: Callable) -> None:
     x = np.random.default_rng(0).normal(size=(LANES, 3)).astype(np.float32)
-    kernel = compile_kernel(swing, one_of(x))
+    kernel = compile_kernel(function, one_of(x))
     whole = kernel(x)
     for lanes in (1, 3, 17):
         np.testing.assert_array_equal(kernel(x[:lanes]), whole[:lanes])

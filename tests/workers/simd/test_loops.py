@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,8 @@ from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph import loops
 from workers.simd.graph.graph import Graph, depending, live
+from workers.simd.graph.operations import compute
+from workers.simd.graph.reference import evaluate
 from workers.simd.graph.schedule import Region, schedule
 
 X = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
@@ -31,12 +34,13 @@ def keep_all_loops(monkeypatch: pytest.MonkeyPatch) -> None:
 def regions(function: Callable[..., Any], *arguments: Any) -> list[Region]:
     """Loops that are computed, outer ones first."""
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*arguments))
+    return found(schedule(graph, outputs).region)
 
-    def inside(region: Region) -> list[Region]:
-        inner = [step for step in region.steps if isinstance(step, Region)]
-        return [*inner, *(deeper for one in inner for deeper in inside(one))]
 
-    return inside(schedule(graph, outputs).region)
+def found(region: Region) -> list[Region]:
+    """Loops of a region, outer ones first."""
+    inner = [step for step in region.steps if isinstance(step, Region)]
+    return [*inner, *(deeper for one in inner for deeper in found(one))]
 
 
 def check(function: Callable[..., Any]) -> None:
@@ -142,8 +146,7 @@ def test_loops_inside_loops() -> None:
 
         return lax.fori_loop(0, 5, outer, (x, x[0]))
 
-    found = regions(function, X[0])
-    assert len(found) == 2
+    assert len(regions(function, X[0])) == 2
     check(function)
 
 
@@ -312,3 +315,113 @@ def test_depending_nodes_are_those_of_the_body() -> None:
     after = graph.op("add", result, outside)
     assert depending(graph, loop) == {loop.carries[0], inside}
     assert {x, inside, outside, after, result, loop.carries[0]} == live(graph, [after])
+
+
+def trips_made(function: Callable[..., Any], x: np.ndarray) -> list[tuple[int, int]]:
+    """(loop, how often its first operation was computed) of each loop, where `x` [lane, 3] are all lanes."""
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(x[0]))
+    first = {region.loop.number: next(step for step in region.steps if isinstance(step, int))
+             for region in found(schedule(graph, outputs).region) if region.loop}  # fmt: skip
+    computed: collections.Counter[int] = collections.Counter()
+
+    def operation(node: int, arguments: Any) -> Any:
+        computed[node] += 1
+        return compute(graph.keys[node][0], arguments)
+
+    evaluate(graph, outputs, np.ascontiguousarray(x.T).view(np.uint32), operation, fuse=False)
+    return [(number, computed[node]) for number, node in sorted(first.items())]
+
+
+HALVES = np.float32([[2.0**-k, 1.0, 1.0] for k in range(6)])
+"""Lanes that need 0 to 5 doublings until x[0] is 1."""
+
+
+def doubled(x):
+    return lax.while_loop(lambda x: x[0] < 1.0, lambda x: x * 2.0, x)
+
+
+def doubled_by_a_scan(x):
+    def trip(carry, _):
+        return lax.cond(carry[1], lambda x: (x * 2.0, x[0] * 2.0 < 1.0), lambda x: (x, False), carry[0]), None
+
+    return lax.scan(trip, (x, x[0] < 1.0), None, length=100)[0][0]
+
+
+@pytest.mark.parametrize("function", [doubled, doubled_by_a_scan])
+def test_a_loop_ends_as_soon_as_no_lane_needs_another_trip(function: Callable[..., Any]) -> None:
+    assert [times for _, times in trips_made(function, HALVES)] == [5]
+    assert [times for _, times in trips_made(function, HALVES[:3])] == [2]
+    assert [times for _, times in trips_made(function, HALVES[:1])] == [0]
+    kernel = compile_kernel(function, jax.ShapeDtypeStruct((3,), jnp.float32))
+    np.testing.assert_array_equal(kernel(HALVES), [2.0**k * row for k, row in enumerate(HALVES)])
+
+
+def test_no_trip_of_an_inner_loop_is_made_for_lanes_that_do_not_need_it() -> None:
+    def by_branches(x):
+        return lax.cond(x[1] > 0, doubled, lambda x: x, x)
+
+    def by_loops(x):
+        """As many trips as x[2] says; in each, x[0] is halved 3 times more often than before, and doubled again."""
+
+        def outer(carry):
+            number, x = carry
+            return number + 1.0, doubled(x * jnp.array([0.125, 1.0, 1.0]))
+
+        return lax.while_loop(lambda carry: carry[0] < x[2], outer, (0.0, x))[1]
+
+    x = HALVES * np.float32([1, -1, 1])
+    assert [times for _, times in trips_made(by_branches, x)] == [0]
+    x[2] = HALVES[2]
+    assert [times for _, times in trips_made(by_branches, x)] == [2]
+    lanes = np.float32([[1, 0, 1], [2.0**-20, 0, 0]])  # the second lane would need 23 doublings
+    outer, inner = trips_made(by_loops, lanes)
+    assert (outer[1], inner[1]) == (1, 3)
+
+
+def test_a_short_loop_whose_end_depends_on_data_becomes_straight_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loops, "UNROLLED_OPERATIONS", 2000)
+
+    def bounded(x):
+        return lax.while_loop(lambda c: (c[0] < 5) & (c[1][0] < 1.0), lambda c: (c[0] + 1, settle(c[1])), (0, x))
+
+    assert regions(bounded, X[0]) == []
+    check(bounded)
+    assert len(regions(doubled, X[0])) == 1  # without a bound
+
+
+def check_random_while(data: st.DataObject) -> None:
+    """Loops that end by their carries, with random bodies, one inside another now and then."""
+    inner_too, most = data.draw(st.booleans()), data.draw(st.floats(0.5, 2.0))
+    steps = data.draw(st.lists(st.sampled_from(STEPS), min_size=1, max_size=4))
+
+    def moved(x):
+        for step in steps:
+            x = {"add": lambda x: x + x[::-1] * 0.3, "mul": lambda x: x * jnp.cos(x[::-1]), "sin": jnp.sin,
+                 "half": lambda x: x * 0.5 + 0.25, "abs": jnp.abs}[step](x)  # fmt: skip
+        return x
+
+    def loop(x, depth, bound):
+        def body(carry):
+            number, _, x = carry
+            x = moved(x)
+            if depth:
+                x = x + 0.1 * loop(x * 0.7, depth - 1, 5)[2]
+            return number + 1, jnp.abs(x).sum(), x
+
+        return lax.while_loop(lambda c: (c[0] < bound) & (c[1] < most), body, (0, jnp.abs(x).sum() * 0.1, x))
+
+    check(lambda x: loop(x, int(inner_too), 9))
+
+
+@pytest.mark.slow
+@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_random_loops_that_data_ends_are_jaxs(data: st.DataObject) -> None:
+    check_random_while(data)
+
+
+@pytest.mark.long
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_so_are_many_that_data_ends(data: st.DataObject) -> None:
+    check_random_while(data)

@@ -79,14 +79,6 @@ def _uniforms(state: Any, action: Any) -> Any:
     return uniforms(state["key"], 2 * state["count"] + jnp.arange(2, dtype=jnp.uint32))
 
 
-def _until(state: Any, action: Any) -> Any:
-    return jax.lax.while_loop(lambda x: x.sum() < 3.0, lambda x: x + 1.0, state["x"])
-
-
-def _at_most(state: Any, action: Any) -> Any:
-    return jax.lax.fori_loop(0, 3, lambda _, x: jnp.where(x.sum() >= 3.0, x, x + 1.0), state["x"])
-
-
 def _chosen(array: Any, index: Any) -> Any:
     return jax.nn.one_hot(index, len(array)) @ array
 
@@ -114,7 +106,6 @@ def _replaced(array: Any, index: Any) -> Any:
             "jnp.minimum and jnp.maximum",
             lambda s, a: jnp.stack([(s["x"] + a[:2]).min(), (s["x"] + a[:2]).max()]),
         ),
-        (_until, "jnp.where(finished, old, new)", _at_most),
     ],
 )
 def test_a_refusal_says_what_the_task_can_do_instead_and_then_it_is_compiled(

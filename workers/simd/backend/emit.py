@@ -156,15 +156,26 @@ class Writer:
         for k in carried:
             self.store(loop.inits[k], loop.carries[k])
             self.slots[loop.results[k]] = self.slots[loop.carries[k]]
-        before = self.values
+        before, builder = self.values, self.builder
 
         def trip(number: str, _: list[str]) -> list[str]:
             values = self.trip(region)
             for k, (llvm_type, value) in zip(carried, values, strict=True):
-                self.builder.store(llvm_type, value, self.memory, self.slots[loop.carries[k]])
+                builder.store(llvm_type, value, self.memory, self.slots[loop.carries[k]])
             return []
 
-        self.builder.loop(loop.trips, trip)
+        if loop.active is None:
+            builder.loop(loop.trips, trip)
+        else:
+            slot = self.slots[loop.carries[loop.active]]
+
+            def some_active() -> str:
+                return builder.any(builder.load(self.words["I"], self.memory, slot))
+
+            def none_active() -> str:
+                return builder.value(f"xor i1 {some_active()}, true")
+
+            builder.when(some_active(), lambda: builder.loop(loop.trips, trip, until=none_active))
         self.values = before
 
     def trip(self, region: Region) -> list[tuple[str, str]]:

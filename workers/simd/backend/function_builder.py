@@ -114,7 +114,7 @@ class FunctionBuilder:
 
     def loop(
         self,
-        trips: str | int,
+        trips: str | int | None,
         body: Callable[[str, Values], Iterable[str]],
         carries: Sequence[tuple[str, str]] = (),
         until: Callable[[], str] | None = None,
@@ -122,7 +122,7 @@ class FunctionBuilder:
         """Repeat a body; returns the carried values after the last trip, or the first ones if there is no trip.
 
         Args:
-            trips: number of trips, or the name of an i64 that has it.
+            trips: most trips, or the name of an i64 that has it; None if only `until` ends the loop.
             body: function (number of the trip, carried values) -> carried values of the next trip.
             carries: (type, first value) of each carried value.
             until: function that gives an i1 at the end of each trip, which ends the loop early if it is true.
@@ -131,7 +131,7 @@ class FunctionBuilder:
             return [first for _, first in carries]
         self._names += 1
         label, before = f"loop{self._names}", self._label
-        if isinstance(trips, int):
+        if not isinstance(trips, str):
             self.do(f"br label %{label}")
         else:
             some = self.value(f"icmp sgt i64 {trips}, 0")
@@ -148,11 +148,11 @@ class FunctionBuilder:
             phis.append(f"  {name} = phi {llvm_type} [ {first}, %{before} ], [ {out}, %{label}_end ]")
         self.lines[place:place] = phis
         self.do(f"%{label}_next = add i64 %{label}_trip, 1")
-        self.do(f"%{label}_more = icmp slt i64 %{label}_next, {trips}")
+        self.do(f"%{label}_more = icmp slt i64 %{label}_next, {2**63 - 1 if trips is None else trips}")
         self.do(f"%{label}_again = select i1 {stop}, i1 false, i1 %{label}_more")
         self.do(f"br i1 %{label}_again, label %{label}, label %{label}_after")
         self.label(f"{label}_after")
-        if isinstance(trips, int):
+        if not isinstance(trips, str):
             return outs
         return [
             self.value(f"phi {llvm_type} [ {first}, %{before} ], [ {out}, %{label}_end ]")

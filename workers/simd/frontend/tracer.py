@@ -6,7 +6,8 @@ kernel nothing. Arithmetic adds nodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from workers.simd.frontend.dtypes import check_bytes, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
-from workers.simd.graph.loops import build_loop
+from workers.simd.graph.loops import build_loop, build_while
 from workers.simd.graph.unsupported import UnsupportedError, refusing, way_round
 
 Nodes = NDArray[np.int64]
@@ -40,6 +41,9 @@ class Tracer:
 
     def __init__(self, graph: FoldingGraph, rules: Mapping[str, Rule]) -> None:
         self.graph, self.rules = graph, rules
+        self.lanes: int | None = None
+        """Bool node: the lanes whose values are needed where the tracer is. None if those of all lanes are, as outside
+        of branches and loops that depend on data."""
 
     def closed(self, closed: ClosedJaxpr, inputs: Sequence[Nodes]) -> list[Nodes]:
         """Outputs of a jaxpr that comes with its constants."""
@@ -108,19 +112,49 @@ class Tracer:
         """Array of an operation's results, element by element."""
         return self.map(lambda *nodes: self.graph.op(name, *nodes), *arrays)
 
+    @contextlib.contextmanager
+    def within(self, mask: int) -> Iterator[None]:
+        """Context manager of a branch or trip that only the lanes need for which a bool node is true."""
+        outer, self.lanes = self.lanes, mask if self.lanes is None else self.graph.op("and", self.lanes, mask)
+        try:
+            yield
+        finally:
+            self.lanes = outer
+
     def keep_loop(self, trips: int, body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]) -> list[Nodes]:
         """Values of `carry` after `trips` trips through `body`, which does not depend on the number of the trip."""
-        shapes = [nodes.shape for nodes in carry]
-        ends = np.cumsum([nodes.size for nodes in carry], dtype=np.int64)
+        shaped = _shaping(carry)
+        results = build_loop(self.graph, trips, lambda nodes: _flat(body(shaped(nodes))), _flat(carry), self.lanes)
+        return shaped(results)
 
-        def flat(arrays: Sequence[Nodes]) -> list[int]:
-            return [node for nodes in arrays for node in nodes.reshape(-1).tolist()]
+    def keep_while(
+        self, condition: Callable[[list[Nodes]], Nodes], body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]
+    ) -> list[Nodes]:
+        """Values of `carry` after trips through `body` for as long as `condition`, one bool, holds."""
+        shaped = _shaping(carry)
 
-        def shaped(nodes: Sequence[int]) -> list[Nodes]:
-            parts = np.split(np.array(nodes, np.int64), ends)[:-1]
-            return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        def trip(nodes: list[int], active: int) -> list[int]:
+            with self.within(active):
+                return _flat(body(shaped(nodes)))
 
-        def straight(nodes: list[int]) -> list[int]:
-            return flat(body(shaped(nodes)))
+        def holds(nodes: list[int]) -> int:
+            return int(condition(shaped(nodes))[()])
 
-        return shaped(build_loop(self.graph, trips, straight, flat(carry)))
+        return shaped(build_while(self.graph, holds, trip, _flat(carry), self.lanes))
+
+
+def _flat(arrays: Sequence[Nodes]) -> list[int]:
+    """Nodes of arrays in one list."""
+    return [node for nodes in arrays for node in nodes.reshape(-1).tolist()]
+
+
+def _shaping(arrays: Sequence[Nodes]) -> Callable[[Sequence[int]], list[Nodes]]:
+    """Function that gives nodes in one list the shapes of some arrays."""
+    shapes = [nodes.shape for nodes in arrays]
+    ends = np.cumsum([nodes.size for nodes in arrays], dtype=np.int64)
+
+    def shaped(nodes: Sequence[int]) -> list[Nodes]:
+        parts = np.split(np.array(nodes, np.int64), ends)[:-1]
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    return shaped

@@ -134,6 +134,13 @@ def _fold_less(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int
     return g.const("b", False) if args[0] == args[1] else None
 
 
+def _fold_signed_less(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    key = g.keys[args[0]]
+    if key[0] == "int_of_bool" and _is(values[1], 1):
+        return g.op("xor", g.const("b", True), key[1])
+    return _fold_less(g, args, values)
+
+
 def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     mask, a, b = args
     if a == b:
@@ -143,8 +150,8 @@ def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> i
     key = g.keys[mask]
     for argument, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
         if _is(g.constant(argument), True):  # the mask is the negation of `other`
-            return g.op("iselect" if g.dtypes[a] == "i" else "select", other, b, a)
-    return None
+            return g.choose(other, b, a)
+    return g.op("and", mask, a) if g.dtypes[b] == "b" and values[2] is not None and not values[2] else None
 
 
 def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
@@ -186,10 +193,11 @@ RULES: dict[str, Rule] = {
     "neg": _fold_neg,
     "abs": _fold_abs,
     "lt": _fold_less,
-    "slt": _fold_less,
+    "slt": _fold_signed_less,
     "ult": _fold_less,
     "select": _fold_select,
     "iselect": _fold_select,
+    "bselect": _fold_select,
     "and": _fold_logic(neutral=True, absorbing=False),
     "or": _fold_logic(neutral=False, absorbing=True),
     "xor": _fold_xor,

@@ -3,13 +3,14 @@
 Equal expressions are one node (hash-consing). a + b and b + a are two nodes, because the rule of fusing in
 `schedule.py` depends on the order of the arguments. The graph that simplifies while it is built is in `folding.py`.
 
-A loop is a `Loop`. Its carries are nodes ("carry") on which its body depends, and its results are nodes ("result") on
-which the code after the loop depends. A node that depends on no carry lies outside of the loop.
+A loop is a `Loop`, of a known number of trips or until no lane needs another one. Its carries are nodes ("carry") on
+which its body depends, and its results are nodes ("result") on which the code after the loop depends. A node that
+depends on no carry lies outside of the loop.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,18 +19,27 @@ import numpy as np
 from workers.simd.graph.operations import NUMPY_DTYPES, OPERATIONS
 
 Key = tuple
+SELECTS = {"f": "select", "i": "iselect", "b": "bselect"}
+"""Operation that chooses between two values, by their dtype."""
 
 
 @dataclass
 class Loop:
-    """A loop of `trips` trips, at least one: carry k starts as inits[k] and becomes outs[k] at the end of each trip."""
+    """A loop in which carry k starts as inits[k] and becomes outs[k] at the end of each trip."""
 
     number: int
-    trips: int
+    trips: int | None
+    """Most trips, at least one; None if only `active` ends the loop."""
     inits: list[int]
     carries: list[int]
     outs: list[int] = field(default_factory=list)
     results: list[int] = field(default_factory=list)
+    active: int | None = None
+    """Position of the carry that says whether a lane needs another trip; None if all lanes make all trips.
+
+    Where it is false, a trip changes nothing. So the loop ends as soon as it is false in all lanes of a vector, and
+    the result of a lane still depends on no other lane.
+    """
 
 
 class Graph:
@@ -93,7 +103,7 @@ class Graph:
                 return (loop.inits[key[3]], loop.outs[key[3]]) if loop.outs else (loop.inits[key[3]],)
         return self.arguments(node)
 
-    def loop(self, trips: int, inits: list[int]) -> Loop:
+    def loop(self, trips: int | None, inits: list[int]) -> Loop:
         """Open a loop whose body is built next from its carries; `close` ends it."""
         number = len(self.loops)
         dtypes = [self.dtypes[node] for node in inits]
@@ -101,14 +111,37 @@ class Graph:
         self.loops.append(Loop(number, trips, list(inits), carries))
         return self.loops[-1]
 
+    def choose(self, mask: int, if_true: int, if_false: int) -> int:
+        """Node that chooses between two nodes of the same dtype by a bool node."""
+        return self.op(SELECTS[self.dtypes[if_true]], mask, if_true, if_false)
+
     def close(self, loop: Loop, outs: list[int]) -> list[int]:
         """Set the nodes that the carries become at the end of a trip; returns the loop's results."""
-        loop.outs = list(outs)
+        loop.outs, loop.active = list(outs), self.ending(loop, outs)
+        assert loop.trips is not None or loop.active is not None, "a loop ends"
         for k, out in enumerate(outs):
             assert self.dtypes[out] == self.dtypes[loop.carries[k]], "a loop carries values of one dtype"
         dtypes = [self.dtypes[node] for node in outs]
         loop.results = [self._node(("result", dtype, loop.number, k), dtype) for k, dtype in enumerate(dtypes)]
         return loop.results
+
+    def ending(self, loop: Loop, outs: Sequence[int]) -> int | None:
+        """Position of the carry without which a trip changes nothing (see `Loop.active`), or None if there is none.
+
+        It becomes itself and something else, and every other carry is chosen by it or never changes.
+        """
+
+        def kept_without(active: int, carry: int, out: int) -> bool:
+            key = self.keys[out]
+            return out == carry or (key[0] in SELECTS.values() and key[1] == active and key[3] == carry)
+
+        for k, active in enumerate(loop.carries):
+            key = self.keys[outs[k]]
+            if key[0] == "and" and active in key[1:]:
+                others = (pair for j, pair in enumerate(zip(loop.carries, outs, strict=True)) if j != k)
+                if all(kept_without(active, carry, out) for carry, out in others):
+                    return k
+        return None
 
     def op(self, name: str, *arguments: int) -> int:
         """Node of an operation on nodes."""

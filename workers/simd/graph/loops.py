@@ -10,7 +10,7 @@ it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from workers.simd.graph.graph import Graph, Loop, depending, live
 from workers.simd.graph.unsupported import UnsupportedError
@@ -26,10 +26,14 @@ MOST_STRAIGHT_TRIPS = 64
 """Most trips of a loop that must become straight code because its body depends on the number of the trip."""
 
 
-def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> list[int]:
+def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int], lanes: int | None = None) -> list[int]:
     """Results of repeating `body`, which maps carries to their ends, as a Loop with few carries or as straight code.
 
     `body` is called again with other carries, and must build the same expressions from the same nodes.
+
+    Args:
+        lanes: bool node that says whether a lane's results are needed; None if those of all lanes are. The others may
+            be anything, and no trip is made for them if the loop ends as soon as no lane needs another trip.
     """
     loop = graph.loop(trips, list(inits))
     try:
@@ -39,14 +43,69 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
             raise
         return _straight(trips, body, inits)  # if the number of the trip is an index, it must be a constant
     inside = depending(graph, loop)
-    if trips * max(1, sum(bool(graph.arguments(node)) for node in inside)) <= UNROLLED_OPERATIONS:
+    if trips * max(1, _operations(graph, inside)) <= UNROLLED_OPERATIONS:
         return _straight(trips, body, inits)
+    active = graph.ending(loop, outs)
+    if active is not None and lanes is not None:
+        loop.inits[active] = graph.op("and", lanes, inits[active])
+    return _reduced(graph, loop, body, outs, inside)
+
+
+def build_while(
+    graph: Graph,
+    condition: Callable[[list[int]], int],
+    body: Callable[[list[int], int], list[int]],
+    inits: Sequence[int],
+    lanes: int | None = None,
+) -> list[int]:
+    """Results of repeating `body` while `condition`, a bool node, holds: as a Loop, or as straight code if it is short.
+
+    Both are called several times.
+
+    Args:
+        body: function (carries, bool node that says which lanes need their ends) -> ends.
+        lanes: see `build_loop`.
+    """
+    first = condition(list(inits))
+    first = first if lanes is None else graph.op("and", lanes, first)
+
+    def chosen(active: int, after: list[int], before: list[int]) -> list[int]:
+        return [new if new == old else graph.choose(active, new, old) for new, old in zip(after, before, strict=True)]
+
+    def trip(nodes: list[int]) -> list[int]:
+        active, *before = nodes
+        after = body(before, active)
+        return [graph.op("and", active, condition(after)), *chosen(active, after, before)]
+
+    loop = graph.loop(None, [first, *inits])
+    outs = trip(loop.carries)
+    inside = depending(graph, loop)
+    # In straight code values go on after the end and only the results are chosen. So a counter stays a constant, and
+    # the condition after the last possible trip folds to false.
+    active, nodes, results = first, list(inits), list(inits)
+    for _ in range(1 + min(UNROLLED_OPERATIONS // max(1, _operations(graph, inside)), MOST_STRAIGHT_TRIPS)):
+        if graph.constant(active) is not None and not graph.constant(active):
+            return results
+        nodes = body(nodes, active)
+        results = chosen(active, nodes, results)
+        active = graph.op("and", active, condition(nodes))
+    return _reduced(graph, loop, trip, outs, inside)[1:]
+
+
+def _operations(graph: Graph, nodes: Iterable[int]) -> int:
+    """How many of some nodes are operations."""
+    return sum(bool(graph.arguments(node)) for node in nodes)
+
+
+def _reduced(graph: Graph, loop: Loop, body: Body, outs: list[int], inside: set[int]) -> list[int]:
+    """Results of a loop, closed with the carries that it needs."""
+    inits = loop.inits
     kept, derived, late, firsts = _sort(graph, loop, outs, inside)
     if len(kept) == len(inits):
         return graph.close(loop, outs)
 
     # Build the same body again, from the carries that are kept and the values derived from them.
-    reduced = graph.loop(trips, [inits[k] for k in kept])
+    reduced = graph.loop(loop.trips, [inits[k] for k in kept])
     # Where several carries have the same end, use the start that `_sort` compared with.
     starts = {outs[k]: carry for k, carry in zip(kept, reduced.carries, strict=True) if k in firsts}
     carries = list(inits)

@@ -113,6 +113,7 @@ OPERATIONS: dict[str, Operation] = {
     "xor": Operation("bb", "b", np.logical_xor, "xor {B} {0}, {1}", commutes=True),
     "select": Operation("bff", "f", np.where, "select {B} {0}, {F} {1}, {F} {2}"),
     "iselect": Operation("bii", "i", np.where, "select {B} {0}, {I} {1}, {I} {2}"),
+    "bselect": Operation("bbb", "b", np.where, "select {B} {0}, {B} {1}, {B} {2}"),
 }
 """Operations by name. Products and sums are separate nodes; `schedule.py` fuses them by its rule."""
 

@@ -5,6 +5,7 @@ A worker compares code that is new to its machine with this, and tests do.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -71,7 +72,9 @@ def evaluate(
             loop = step.loop
             assert loop is not None
             carried = {k: value(loop.inits[k]) for k in step.carried}
-            for _ in range(loop.trips):
+            for _ in itertools.count() if loop.trips is None else range(loop.trips):
+                if loop.active is not None and not carried[loop.active].any():
+                    break
                 values.update({loop.carries[k]: array for k, array in carried.items()})
                 run(step)
                 carried = {k: value(loop.outs[k]) for k in step.carried}

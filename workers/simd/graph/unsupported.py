@@ -23,7 +23,6 @@ WAYS_ROUND = {
     "scatter-add": _UPDATE.replace(".set(x)", ".add(x)").replace("x, array", "array + x, array"),
     "scatter-mul": _UPDATE.replace(".set(x)", ".multiply(x)").replace("x, array", "array * x, array"),
     "sort": "order a few numbers by jnp.minimum and jnp.maximum of pairs of them",
-    "while": "use a fixed number of trips, in which what is finished no longer changes: jnp.where(finished, old, new)",
     **dict.fromkeys(("cholesky", "lu", "qr", "eigh", "svd", "triangular_solve"), _FORMULA),
 }
 """Primitive that is not supported, or not with data -> what a task can do instead."""

@@ -96,10 +96,7 @@ def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes
 
 def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
     """Node that chooses between two nodes of the same dtype by a bool node."""
-    node_dtype = g.dtypes[if_true]
-    if node_dtype != "b":
-        return g.op("select" if node_dtype == "f" else "iselect", mask, if_true, if_false)
-    return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
+    return g.choose(mask, if_true, if_false)
 
 
 def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]) -> list[Nodes]:

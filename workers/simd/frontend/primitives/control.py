@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from workers.simd.frontend.dtypes import dtype_in
 from workers.simd.frontend.primitives.choices import select
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
-from workers.simd.graph.unsupported import UnsupportedError, way_round
+from workers.simd.graph.unsupported import UnsupportedError
 
 MOST_TRIPS = 10_000
 """Most trips of a while loop, or of a scan with inputs or outputs per step; both become straight code."""
@@ -33,12 +34,19 @@ def _platform_index(t: Tracer, equation: Any) -> Nodes:
 
 @primitive("cond")
 def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]:
-    """Results of the chosen branch. If the choice is no constant, all branches are computed and then chosen from."""
-    branches = equation.params["branches"]
-    value = t.values(which)
+    """Results of the chosen branch. If the choice is no constant, all branches are computed and then chosen from.
+
+    Loops of a branch make no trips for lanes that take another one.
+    """
+    branches, value = equation.params["branches"], t.values(which)
     if value is not None:
         return t.closed(branches[min(max(int(value), 0), len(branches) - 1)], arrays)
-    return select(t, dtype_in(equation), which, [t.closed(branch, arrays) for branch in branches])
+    cases = []
+    for number, branch in enumerate(branches):
+        taken = [t.constants(np.bool_(k == number)) for k in range(len(branches))]
+        with t.within(int(select(t, dtype_in(equation), which, [[case] for case in taken])[0][()])):
+            cases.append(t.closed(branch, arrays))
+    return select(t, dtype_in(equation), which, cases)
 
 
 @primitive("scan")
@@ -82,17 +90,35 @@ def _counts(params: dict[str, Any]) -> tuple[int, int]:
 
 @primitive("while")
 def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
-    """Results of a while loop as straight code; the number of trips must be known while tracing."""
+    """Results of a while loop: straight code if the number of trips is known while tracing.
+
+    Under vmap, the condition has an element for each element of the carries' leading axes, as in JAX's lowering of it:
+    the loop goes on while any is true, and where one is false its carries stay as they are.
+    """
     params = equation.params
     in_condition, in_body = params["cond_nconsts"], params["body_nconsts"]
     for_condition, for_body = arrays[:in_condition], arrays[in_condition : in_condition + in_body]
-    carry = list(arrays[in_condition + in_body :])
+    starts = list(arrays[in_condition + in_body :])
+
+    def elements(carry: list[Nodes]) -> Nodes:
+        return t.closed(params["cond_jaxpr"], [*for_condition, *carry])[0]
+
+    def condition(carry: list[Nodes]) -> Nodes:
+        return np.array(functools.reduce(functools.partial(t.graph.op, "or"), elements(carry).reshape(-1).tolist()))
+
+    def body(carry: list[Nodes]) -> list[Nodes]:
+        going, after = elements(carry), t.closed(params["body_jaxpr"], [*for_body, *carry])
+        if not going.shape:
+            return after
+        masks = [going.reshape(*going.shape, *[1] * (new.ndim - going.ndim)) for new in after]
+        return [t.map(t.graph.choose, mask, new, old) for mask, new, old in zip(masks, after, carry, strict=True)]
+
+    carry = starts
     for _ in range(MOST_TRIPS):
-        (go_on,) = t.closed(params["cond_jaxpr"], [*for_condition, *carry])
-        value = t.values(go_on)
+        value = t.values(condition(carry))
         if value is None:
-            raise UnsupportedError("a while loop whose end depends on the state", advice=way_round("while"))
+            return t.keep_while(condition, body, starts)
         if not value:
             return carry
-        carry = t.closed(params["body_jaxpr"], [*for_body, *carry])
+        carry = body(carry)
     raise UnsupportedError(f"a while loop of more than {MOST_TRIPS:,} trips, the most that is supported")
