@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.noise import Domain, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
-from workers.environments import describe_environment
+from workers.environments import describe_environment, make_environment
+from workers.simd.backend.target import host_target
+from workers.simd.backend.words import unpack
 from workers.simd.episodes import rollout
-from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.episodes.kernel import compile_kernel, compile_resets
 from workers.simd.frontend.primitives import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -80,3 +83,17 @@ def test_what_a_rule_did_not_foresee_is_refused_by_name_and_place(monkeypatch: p
     monkeypatch.setitem(PRIMITIVES, "sin", rule)
     with pytest.raises(UnsupportedError, match=r"KeyError: 'axis'\) \(at .*test_resets\.py"):
         compile_kernel(lambda x: jnp.sin(x) + 1.0, jax.ShapeDtypeStruct((), jnp.float32))
+
+
+@pytest.mark.slow
+def test_resets_of_jax_do_not_depend_on_how_many_chunks_are_computed_together() -> None:
+    """XLA rounds the resets of this ant in other ways for 240 of them than for 60."""
+    pairs = 30
+    environment = make_environment("brax:ant", {})
+    resets = compile_resets(environment.reset, host_target(), None, 2 * pairs)
+    keys_L = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(8 * pairs))
+    leaves = jax.tree.leaves(jax.eval_shape(environment.reset, keys_L[0]))
+    together = unpack(resets(keys_L), leaves, len(keys_L))
+    alone = [unpack(resets(keys_M), leaves, len(keys_M)) for keys_M in np.split(keys_L, 4)]
+    for leaf, *parts in zip(together, *alone, strict=True):
+        np.testing.assert_array_equal(leaf, np.concatenate(parts))

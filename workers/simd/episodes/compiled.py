@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable
 from workers.environments import Environment
@@ -213,7 +213,8 @@ def compile_episodes(
     target = target or host_target()
     kind = {"training": training, "per_lane_weights": per_lane_weights, "finds_faults": finds_faults}
     program = write_episodes(environment, spec, inputs_O, target, **kind)
-    begin = compile_resets(program.steps.begin, target, folder, check_resets)
+    lanes = 2 * spec.chunk_pairs if training else EVALUATION_EPISODES_PER_CHUNK
+    begin = compile_resets(program.steps.begin, target, folder, lanes, check_resets)
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 
     def kernel(native: Native) -> EpisodeKernel:

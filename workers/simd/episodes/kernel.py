@@ -153,12 +153,16 @@ def compile_kernel(
 
 
 def compile_resets(
-    begin: Callable[[Any], Any], target: Target, folder: Path | None, check: Check = no_check
+    begin: Callable[[Any], Any], target: Target, folder: Path | None, lanes: int, check: Check = no_check
 ) -> Compilable:
     """Function from reset keys [lane, 4] to words of carries, compiled here by simd if possible and otherwise by JAX.
 
     Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
     the bits of those that JAX compiles may differ between processors.
+
+    Args:
+        lanes: number of resets that JAX computes at a time, that of one chunk. Their bits depend on it, and must not
+            depend on how many chunks a worker computes together; another number would also have to be compiled.
     """
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     try:
@@ -167,9 +171,12 @@ def compile_resets(
         resets = jitted(jax.vmap(begin))
 
         def packed(keys_L: np.ndarray) -> np.ndarray:
-            return pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
+            rows = np.arange(-(-len(keys_L) // lanes) * lanes).reshape(-1, lanes) % len(keys_L)
+            parts = [jax.tree.leaves(resets(keys_L[row])) for row in rows]
+            leaves = [np.concatenate(leaf)[: len(keys_L)] for leaf in zip(*parts, strict=True)]
+            return pack(leaves, target.width)
 
-        return Compilable(packed, resets.compile)
+        return Compilable(packed, lambda keys_L: resets.compile(np.zeros((lanes, KEY_WORDS), np.uint32)))
 
     def words(keys_L: np.ndarray) -> np.ndarray:
         keys = pack([keys_L], target.width)
