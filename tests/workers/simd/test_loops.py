@@ -317,9 +317,16 @@ def test_depending_nodes_are_those_of_the_body() -> None:
     assert {x, inside, outside, after, result, loop.carries[0]} == live(graph, [after])
 
 
-def trips_made(function: Callable[..., Any], x: np.ndarray) -> list[tuple[int, int]]:
-    """(loop, how often its first operation was computed) of each loop, where `x` [lane, 3] are all lanes."""
-    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(x[0]))
+def trips_made(function: Callable[..., Any], x: np.ndarray, alive: np.ndarray | None = None) -> list[tuple[int, int]]:
+    """(loop, how often its first operation was computed) of each loop.
+
+    `x` [lane, 3] are all lanes, of which only those that are alive need results, if that is given.
+    """
+    words, avals = np.ascontiguousarray(x.T).view(np.uint32), [jnp.zeros(3)]
+    if alive is not None:
+        words, avals = np.concatenate([words, alive[None].astype(np.uint32)]), [*avals, jnp.array(True)]
+    closed = jax.make_jaxpr(lambda x, *_: function(x))(*avals)
+    graph, _, outputs = trace_jaxpr(closed, lanes_word=None if alive is None else 3)
     first = {region.loop.number: next(step for step in region.steps if isinstance(step, int))
              for region in found(schedule(graph, outputs).region) if region.loop}  # fmt: skip
     computed: collections.Counter[int] = collections.Counter()
@@ -328,7 +335,7 @@ def trips_made(function: Callable[..., Any], x: np.ndarray) -> list[tuple[int, i
         computed[node] += 1
         return compute(graph.keys[node][0], arguments)
 
-    evaluate(graph, outputs, np.ascontiguousarray(x.T).view(np.uint32), operation, fuse=False)
+    evaluate(graph, outputs, words, operation, fuse=False)
     return [(number, computed[node]) for number, node in sorted(first.items())]
 
 
@@ -373,6 +380,7 @@ def test_no_trip_of_an_inner_loop_is_made_for_lanes_that_do_not_need_it() -> Non
     assert [times for _, times in trips_made(by_branches, x)] == [0]
     x[2] = HALVES[2]
     assert [times for _, times in trips_made(by_branches, x)] == [2]
+    assert trips_made(doubled, HALVES, np.arange(6) < 3)[0][1] == 2  # of an episode that is over
     lanes = np.float32([[1, 0, 1], [2.0**-20, 0, 0]])  # the second lane would need 23 doublings
     outer, inner = trips_made(by_loops, lanes)
     assert (outer[1], inner[1]) == (1, 3)

@@ -98,7 +98,7 @@ def write_episodes(
 
     @functools.cache
     def graphs() -> tuple[Traced, Traced]:
-        return trace_jaxpr(normalised_observation), trace_jaxpr(advance)
+        return trace_jaxpr(normalised_observation), trace_jaxpr(advance, lanes_word=alive_word)
 
     def text() -> str:
         kept = [word for place in of_steps.values() for word in place]

@@ -15,7 +15,9 @@ from workers.simd.graph.unsupported import refusing
 
 
 @refusing()
-def trace_jaxpr(closed: ClosedJaxpr, *, folds_zeros: bool = True) -> tuple[FoldingGraph, int, list[int]]:
+def trace_jaxpr(
+    closed: ClosedJaxpr, *, folds_zeros: bool = True, lanes_word: int | None = None
+) -> tuple[FoldingGraph, int, list[int]]:
     """Graph of a function of one lane, as (graph, number of input words, output nodes).
 
     Each element of each input array is an input of the graph, in order, and each element of each output array an
@@ -23,6 +25,8 @@ def trace_jaxpr(closed: ClosedJaxpr, *, folds_zeros: bool = True) -> tuple[Foldi
 
     Args:
         folds_zeros: see `FoldingGraph`.
+        lanes_word: number of the input word, a bool, that says whether a lane's results are needed. Loops whose ends
+            depend on data make no trips for the others. Those of all lanes are needed if None.
 
     Raises:
         UnsupportedError: the function cannot be compiled.
@@ -34,5 +38,7 @@ def trace_jaxpr(closed: ClosedJaxpr, *, folds_zeros: bool = True) -> tuple[Foldi
         node_dtype = graph_dtype(variable.aval.dtype)
         nodes = [graph.input(node_dtype, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
         inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
-    outputs = Tracer(graph, PRIMITIVES).closed(closed, inputs)
+    tracer = Tracer(graph, PRIMITIVES)
+    tracer.lanes = None if lanes_word is None else graph.input("b", lanes_word)
+    outputs = tracer.closed(closed, inputs)
     return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]
