@@ -8,8 +8,10 @@ import subprocess
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 from tests.benchmarks.gpu.kernels import (
     FIVE,
@@ -74,6 +76,28 @@ def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, quick: bool, 
         carry = kernel(carry, action)
     on_host(functions, "physics")(states, np.ascontiguousarray(actions.transpose(0, 2, 1)), LANES, steps)
     np.testing.assert_array_equal(without_nans(states), without_nans(words_of(carry)))
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_loops_that_data_ends_have_the_bits_of_kernels_for_single_lanes(quick: bool, one: Target) -> None:
+    def function(x):
+        def trip(carry):
+            number, x = carry
+            return number + 1, lax.while_loop(lambda x: jnp.abs(x).max() > 0.1, lambda x: jnp.sin(x[::-1]) / 1.7, x * 9)
+
+        return lax.while_loop(lambda carry: carry[0] < jnp.abs(x[0]) * 9, trip, (0, x))[1]
+
+    x = np.random.default_rng(0).normal(size=(LANES, 2)).astype(np.float32)
+    of = jax.ShapeDtypeStruct((2,), np.float32)
+    made = function_of("f", function, [("x", of)], "found", one, quick=quick)
+    pointers = [Pointer("x"), Pointer("found")]
+    found = np.zeros((2, LANES), np.uint32)
+    on_host([*made, lane_function("k", pointers, [Call(made[-1], ("x", "found"))], one)], "k")(
+        np.ascontiguousarray(x.T), found, LANES, 1
+    )
+    np.testing.assert_array_equal(found, words_of(compile_kernel(function, of)(x)))
+    made = function_of("f", function, [("x", of)], "found", target_of("ptx"), quick=quick)
+    assert ptx([*made, lane_function("k", pointers, [Call(made[-1], ("x", "found"))], target_of("ptx"))])
 
 
 @pytest.mark.parametrize("quick", [False, True])

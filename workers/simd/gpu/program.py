@@ -42,6 +42,7 @@ def function_of(
     shared: Sequence[str] = (),
     *,
     quick: bool = False,
+    lanes_word: int | None = None,
 ) -> list[FunctionBuilder]:
     """Function `void name(ptr ..., i64 lanes)` of a JAX function, and functions that it calls; it is the last one.
 
@@ -50,8 +51,10 @@ def function_of(
         out: pointer to the words of the result.
         shared: pointers whose words are neighbours. If all are, there is no parameter `lanes`.
         quick: whether quotients and roots are those of `quick_division.py`.
+        lanes_word: see `trace_jaxpr`.
     """
-    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(tree for _, tree in arguments)))
+    closed = jax.make_jaxpr(function)(*(tree for _, tree in arguments))
+    graph, _, outputs = trace_jaxpr(closed, lanes_word=lanes_word)
     sources = [(pointer, words_in(tree)) for pointer, tree in arguments]
     apart = sorted({*(pointer for pointer, _ in arguments), out} - set(shared))
     exact = graph_function(name + EXACT * quick, graph, outputs, sources, out, target, apart)
@@ -100,7 +103,8 @@ def step_functions(
         "see", steps.normalised_observation, [of_carry, of_constants, of_constants], "seen", target, ["constants"]
     )
     given = [of_carry, of_constants, ("seen", inputs), ("actions", outputs), ("action_keys", KEY)]
-    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick=quick)
+    alive = words_in(carry.state)
+    move = function_of("move", steps.advance, given, "carries", target, ["constants"], quick=quick, lanes_word=alive)
     carries, constants, seen = Pointer("carries"), Pointer("constants", by_lane=False), Pointer("seen")
     sees = Call(see[-1], ("carries", "constants", "seen"))
     moves = Call(move[-1], ("carries", "constants", "seen", "actions", "action_keys"))
