@@ -1,0 +1,103 @@
+"""Models of MuJoCo in JAX: limits of contacts, what MJX lacks, and small models by simd beside xla."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from workers.environments import TaskError, mujoco_parts
+from workers.environments.mujoco_parts import MjModel, mujoco
+
+BALLS = """<mujoco>
+  <option gravity="0 0 -10" {option}/>
+  {custom}
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <site name="s"/>
+    <body name="first" pos="0 0 0.1"><freejoint/><geom name="a" size="0.1" mass="1"/></body>
+    <body name="second" pos="1 0 0.3"><freejoint/><geom name="b" size="0.3" mass="2"/></body>
+    {more}
+  </worldbody>
+  {after}
+</mujoco>"""
+AFTER_MANY = """<custom><numeric name="init_qpos" data="0 0 0 0"/><numeric name="max_contact_points" data="2"/>
+  <numeric name="max_geom_pairs" data="1"/></custom>"""
+
+
+EGG, BOX = (
+    f'<geom name="{name}" type="{kind}" size=".1 .2 .3" mass="1"/>'
+    for name, kind in (("egg", "ellipsoid"), ("box", "box"))
+)
+PUSH = '<motor name="x" site="s" group="1"/>'
+
+
+def model_of(option: str = "", custom: str = "", more: str = "", after: str = "") -> MjModel:
+    return mujoco.MjModel.from_xml_string(BALLS.format(option=option, custom=custom, more=more, after=after))
+
+
+def contacts(mx: Any) -> int:
+    """Number of contacts that MJX computes."""
+    data: Any = mujoco_parts.mjx.make_data(mx)
+    return data._impl.ncon
+
+
+def test_limits_of_contacts_are_those_that_the_model_names():
+    """MJX reads them as if each number had one value before it, and then has no contact at all."""
+    model = model_of(custom=AFTER_MANY)
+    before = model.numeric_data.copy()
+    assert mujoco_parts.contact_limits(model) == {"max_contact_points": 2, "max_geom_pairs": 1}
+    assert contacts(mujoco_parts.put_model(model)) == 2
+    assert contacts(mujoco_parts.put_model(model, all_pairs=True)) == 3  # two on the floor, one between the balls
+    np.testing.assert_array_equal(model.numeric_data, before)
+
+
+@pytest.mark.parametrize("custom", ["", '<custom><numeric name="max_contact_points" data="2"/></custom>'])
+def test_limits_that_mjx_reads_right_stay_as_they_are(custom: str):
+    model = model_of(custom=custom)
+    assert contacts(mujoco_parts.put_model(model)) == (2 if custom else 3)
+    assert contacts(mujoco_parts.put_model(model, all_pairs=True)) == 3
+
+
+def test_a_state_begins_at_rest_or_as_given():
+    mx = mujoco_parts.put_model(model_of())
+    state = mujoco_parts.start(mx)
+    np.testing.assert_allclose(state.qpos, model_of().qpos0)
+    assert not np.any(state.qvel)
+    assert [leaf.shape for leaf in state] == [(14,), (12,), (0,), (12,), ()]
+    assert all(leaf.dtype == np.float32 for leaf in state)
+    np.testing.assert_array_equal(mujoco_parts.start(mx, qvel=np.ones(12)).qvel, np.ones(12))
+
+
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        ({"option": 'solver="PGS"'}, "option solver = pgs; must be cg or newton"),
+        ({"option": 'integrator="implicit"'}, "option integrator = implicit; must be euler or implicitfast or rk4"),
+        ({"option": 'integrator="discrete"'}, "option integrator = discrete"),
+        ({"option": 'noslip_iterations="3"'}, "option noslip_iterations = 3; must be 0"),
+        ({"option": 'density="1" integrator="implicitfast"'}, "with the integrator implicitfast; must be Euler or RK4"),
+        ({"after": '<option><flag sleep="enable" energy="enable"/></option>'}, "energy = enable; flag sleep = enable"),
+        ({"after": '<actuator><adhesion name="x" body="first" ctrlrange="0 1"/></actuator>'}, "x' (transmission body)"),
+        ({"after": '<actuator><general name="x" site="s" dyntype="user"/></actuator>'}, "actuator 'x' (dynamics user)"),
+        ({"after": '<actuator><motor name="x" site="s" delay="0.1" nsample="5"/></actuator>'}, "actuator 'x' (delay)"),
+        (
+            {"option": 'actuatorgroupdisable="1"', "after": f"<actuator>{PUSH}</actuator>"},
+            "actuator 'x' (disabled by its group 1)",
+        ),
+        ({"after": '<sensor><distance name="x" geom1="a" geom2="b"/></sensor>'}, "sensor 'x' (type geomdist)"),
+        (
+            {"option": 'density="1"', "more": '<geom name="x" size=".1" fluidshape="ellipsoid"/>'},
+            "geom 'x' (fluidshape ellipsoid)",
+        ),
+        (
+            {"more": f"<body><freejoint/>{EGG}</body><body><freejoint/>{BOX}</body>"},
+            "collisions of geom 'egg' (ellipsoid) with geom 'box' (box)",
+        ),
+    ],
+)  # fmt: skip
+def test_what_mjx_lacks_is_refused_by_its_name(parts: dict[str, str], named: str):
+    with pytest.raises(TaskError, match=r"^MJX lacks parts of this MuJoCo model: ") as refused:
+        mujoco_parts.put_model(model_of(**parts))
+    assert named in str(refused.value)

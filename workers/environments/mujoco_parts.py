@@ -1,0 +1,200 @@
+"""Models of MuJoCo in JAX (MJX): the small state of a model, its control step, and what MJX lacks.
+
+A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
+implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
+makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
+own and is used as it is.
+
+Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
+(`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
+be what simd cannot compile.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from workers.environments import TaskError
+from workers.environments.brax_parts import quietly
+
+mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains
+with quietly():
+    from mujoco import mjx
+    from mujoco.mjx._src import collision_driver, support, types
+
+MjModel = Any
+"""A model of C MuJoCo, `mujoco.MjModel`."""
+LIMITS = ("max_contact_points", "max_geom_pairs")
+"""Custom numbers (`numeric`) of a model that limit its contacts in MJX: most contacts of each `condim`, the deepest
+first, and most pairs of geoms of each two types, the nearest first. C MuJoCo knows none."""
+
+
+class MujocoState(NamedTuple):
+    """State of a model between two control steps: all that the next one depends on."""
+
+    qpos: Any
+    """[nq] positions: metres, radians, unit quaternions (w, x, y, z)."""
+    qvel: Any
+    """[nv] velocities: metres and radians per second."""
+    act: Any
+    """[na] activations of the actuators that have one."""
+    warmstart: Any
+    """[nv] accelerations of the last substep, at which the solver of the constraints may begin."""
+    time: Any
+    """Seconds since the start."""
+
+
+def contact_limits(model: MjModel) -> dict[str, int]:
+    """The limits of contacts that a model declares, of `LIMITS`; those that it lacks are left out."""
+    numbers = {name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name) for name in LIMITS}
+    return {name: int(model.numeric_data[model.numeric_adr[at]]) for name, at in numbers.items() if at >= 0}
+
+
+def put_model(model: MjModel, *, all_pairs: bool = False) -> mjx.Model:
+    """MJX's model.
+
+    MJX looks for the limits of contacts at a wrong place if a `numeric` of several numbers comes before them, and then
+    may compute no contact at all without a word. Here they are where it looks; the other custom numbers of MJX's model
+    must not be used.
+
+    Args:
+        model: a model, which is not changed.
+        all_pairs: whether to compute all contacts, as C MuJoCo does, and not only so many as the model's limits allow.
+            With limits, which contacts are computed depends on the state, and what the left out ones would push is
+            missing. All of few pairs compile to less code, which is faster, than a choice among them.
+
+    Raises:
+        TaskError: MJX, in which the model would be another one or none, lacks elements of it; the message names each.
+    """
+    if lacking := list(_lacking(model)):
+        raise TaskError(f"MJX lacks parts of this MuJoCo model: {'; '.join(lacking)}")
+    limits, model = contact_limits(model), copy.copy(model)
+    for name, limit in limits.items():
+        at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+        model.numeric_data[at] = -1 if all_pairs else limit  # MJX reads numeric_data[at], not [numeric_adr[at]]
+    try:
+        with quietly():
+            return mjx.put_model(model, impl="jax")
+    except NotImplementedError as error:
+        raise TaskError(f"MJX lacks parts of this MuJoCo model: {error}") from error
+
+
+def start(model: mjx.Model, qpos: Any = None, qvel: Any = None) -> MujocoState:
+    """State of a model with these positions [nq] and velocities [nv]; those of `qpos0`, and 0, if None."""
+    data, dtype = mjx.make_data(model), model.qpos0.dtype
+    qpos, qvel = (own if given is None else given for own, given in ((data.qpos, qpos), (data.qvel, qvel)))
+    zeros = (data.act, data.qacc_warmstart, data.time)
+    return MujocoState(*(jnp.asarray(array, dtype) for array in (qpos, qvel, *zeros)))
+
+
+def step(model: mjx.Model, state: MujocoState, ctrl: Any, substeps: int = 1) -> MujocoState:
+    """State of a model one control step later.
+
+    Args:
+        ctrl: [nu] controls, which MuJoCo clips to their ranges, and which are the same in all substeps.
+        substeps: steps of `opt.timestep` in a control step.
+    """
+    empty = mjx.make_data(model)
+
+    def substep(state: MujocoState, _: None) -> tuple[MujocoState, None]:
+        return _state(mjx.step(model, _data(empty, state, ctrl))), None
+
+    return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, None, length=substeps)[0]
+
+
+def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
+    """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors."""
+    return mjx.forward(model, _data(mjx.make_data(model), state, ctrl))
+
+
+def contact_forces(model: mjx.Model, data: Any) -> Any:
+    """[contacts, 3] forces of the first geom of each contact on the second in the world frame, in newtons.
+
+    The contacts are those of `data._impl.contact`. A pair of geoms that do not touch has contacts of force 0.
+    """
+    contacts = range(len(data._impl.contact.dim))
+    forces = [support.contact_force(model, data, contact, to_world_frame=True)[:3] for contact in contacts]
+    return jnp.stack(forces) if forces else jnp.zeros((0, 3))
+
+
+def _data(empty: mjx.Data, state: MujocoState, ctrl: Any) -> mjx.Data:
+    qpos, qvel, act, warmstart, time = state
+    return empty.replace(qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warmstart, time=time, ctrl=ctrl)
+
+
+def _state(data: Any) -> MujocoState:
+    return MujocoState(data.qpos, data.qvel, data.act, data.qacc_warmstart, data.time)
+
+
+_ELEMENTS = (
+    ("actuator", "mjOBJ_ACTUATOR", "actuator_trntype", types.TrnType, mujoco.mjtTrn, "transmission"),
+    ("actuator", "mjOBJ_ACTUATOR", "actuator_dyntype", types.DynType, mujoco.mjtDyn, "dynamics"),
+    ("actuator", "mjOBJ_ACTUATOR", "actuator_gaintype", types.GainType, mujoco.mjtGain, "gain"),
+    ("actuator", "mjOBJ_ACTUATOR", "actuator_biastype", types.BiasType, mujoco.mjtBias, "bias"),
+    ("equality", "mjOBJ_EQUALITY", "eq_type", types.EqType, mujoco.mjtEq, "type"),
+    ("sensor", "mjOBJ_SENSOR", "sensor_type", types.SensorType, mujoco.mjtSensor, "type"),
+)
+"""(word for an element, its kind, array of the model, what MJX has of it, what C MuJoCo has, word for it)."""
+_OPTIONS = (
+    ("integrator", {types.IntegratorType.EULER, types.IntegratorType.RK4, types.IntegratorType.IMPLICITFAST},
+     mujoco.mjtIntegrator),
+    ("solver", types.SolverType, mujoco.mjtSolver),
+    ("cone", types.ConeType, mujoco.mjtCone),
+)  # fmt: skip
+"""(option, what MJX has of it, what C MuJoCo has). MJX's own list of integrators has one that its step lacks."""
+
+
+def _word(value: Any) -> str:
+    """The last part of the name of a constant of MuJoCo, as in XML."""
+    return value.name.rpartition("_")[2].lower()
+
+
+def _lacking(model: MjModel) -> Iterator[str]:
+    """Elements of a model that MJX refuses or leaves out, in words."""
+
+    def named(word: str, kind: str, at: int) -> str:
+        return f"{word} {mujoco.mj_id2name(model, getattr(mujoco.mjtObj, kind), at) or at!r}"
+
+    option = model.opt
+    for name, has, of_c in _OPTIONS:
+        if (value := getattr(option, name)) not in {*has}:
+            choices = " or ".join(sorted(_word(of_c(int(one))) for one in has))
+            yield f"option {name} = {_word(of_c(value))}; must be {choices}"
+    if option.noslip_iterations:
+        yield f"option noslip_iterations = {option.noslip_iterations}; must be 0"
+    has_fluid = option.density > 0 or option.viscosity > 0 or option.wind.any()
+    if has_fluid and option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        yield "options density, viscosity and wind with the integrator implicitfast; must be Euler or RK4"
+    for bit in range(mujoco.mjtEnableBit.mjNENABLE):
+        if option.enableflags & 1 << bit and 1 << bit != mujoco.mjtEnableBit.mjENBL_INVDISCRETE:
+            yield f"flag {_word(mujoco.mjtEnableBit(1 << bit))} = enable"
+    for word, kind, array, has, of_c, part in _ELEMENTS:
+        for at, value in enumerate(getattr(model, array)):
+            if value not in {*has}:
+                yield f"{named(word, kind, at)} ({part} {_word(of_c(value))})"
+    for at, group in enumerate(model.actuator_group):
+        if option.disableactuator & 1 << max(int(group), 0):
+            yield f"{named('actuator', 'mjOBJ_ACTUATOR', at)} (disabled by its group {group})"
+    for word, kind in (("actuator", "mjOBJ_ACTUATOR"), ("sensor", "mjOBJ_SENSOR")):
+        for at in np.flatnonzero(getattr(model, f"{word}_history")[:, 0]):
+            yield f"{named(word, kind, int(at))} (delay)"
+    for at in np.flatnonzero(model.geom_fluid.reshape(model.ngeom, -1)[:, :1]) if has_fluid else ():
+        yield f"{named('geom', 'mjOBJ_GEOM', int(at))} (fluidshape ellipsoid)"
+    for at in range(model.nflex):
+        yield named("flex", "mjOBJ_FLEX", at)
+    for at in range(model.nplugin):
+        yield named("plugin", "mjOBJ_PLUGIN", at)
+    if not option.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        for first, second, _ in collision_driver.geom_pairs(model):
+            kinds = model.geom_type[[first, second]]
+            if not collision_driver.has_collision_fn(*kinds):
+                each = [f"{named('geom', 'mjOBJ_GEOM', int(at))} ({_word(mujoco.mjtGeom(kind))})"
+                        for at, kind in zip((first, second), kinds, strict=True)]  # fmt: skip
+                yield f"collisions of {' with '.join(each)}"
