@@ -32,6 +32,9 @@ def rollouts(
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.0, help="Duration of each measurement in seconds.")
     ] = 3.0,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="task.options.KEY=VALUE", help="Change an option of the tasks.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
 ) -> None:
     """Measure environment steps per second: with and without a policy, on one core and on all."""
@@ -48,7 +51,7 @@ def rollouts(
     if odd := [number for number in batch or () if number % 2]:
         raise ConfigError(f"--batch {odd[0]}: must be even, so that it consists of whole pairs")
     rows = measured.bench_rollouts(
-        task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds
+        task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds, overrides=set_ or ()
     )
     if as_json:
         print(json.dumps(list(rows), indent=1))

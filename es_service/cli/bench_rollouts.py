@@ -10,7 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from es_service.config.problems import did_you_mean_task, one_of
+from es_service.config.fields import TASK_OPTIONS
+from es_service.config.keys import Overrides, parse_overrides
+from es_service.config.options import options_of, read_options
+from es_service.config.problems import did_you_mean_task, one_of, problem_of
 from es_service.config.tasks import ROLLOUTS, TASKS
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
@@ -31,6 +34,7 @@ def bench_rollouts(
     rollouts: Sequence[str] = (),
     batches: Sequence[int] = (),
     seconds: float = 3.0,
+    overrides: Overrides = (),
 ) -> Iterator[dict[str, Any]]:
     """Yield one row per task, policy (on, off), rollout, batch and number of cores (one, all), as each is measured.
 
@@ -38,9 +42,12 @@ def bench_rollouts(
     rates of several, measured at the same time, are added. If a rollout cannot run a task, its rows are replaced by
     one row {"task", "rollout", "note"}.
 
+    Args:
+        overrides: values of `task.options`, which all of the tasks must have.
+
     Raises:
-        ConfigError: a task is unknown. EvaluationError: a task cannot be measured, or a rollout cannot run it and no
-            other was requested.
+        ConfigError: a task is unknown, or lacks an option.
+        EvaluationError: a task cannot be measured, or a rollout cannot run it and no other was requested.
     """
     for task in tasks:
         if task not in TASKS:
@@ -49,6 +56,7 @@ def bench_rollouts(
                 f"python:module:Class, function:module:name, or module:Class"
                 f"{did_you_mean_task(task, TASKS)}"
             )
+    options = {task: _options(task, overrides) for task in tasks or TASKS}
     every = sorted({1, cores()})
     for task in tasks or TASKS:
         cannot: set[str] = set()
@@ -59,7 +67,7 @@ def bench_rollouts(
             for batch, count in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
                 arguments = {
                     "task": task,
-                    "options": {},
+                    "options": options[task],
                     "hidden": HIDDEN.get(task, ANT_HIDDEN),
                     "policy": policy,
                     "batch": batch,
@@ -73,6 +81,17 @@ def bench_rollouts(
                 if "note" in row:
                     cannot.add(rollout)
                     break
+
+
+def _options(task: str, overrides: Overrides) -> dict[str, Any]:
+    """Options of a task that overrides give."""
+    values, problems = parse_overrides(overrides)
+    problems += [problem_of(key, value, f"only {TASK_OPTIONS}NAME can be set here")
+                 for key, value in values.items() if not key.startswith(TASK_OPTIONS)]  # fmt: skip
+    read, unknown = read_options(values, TASKS[task])
+    if problems or unknown:
+        raise ConfigError.listing(f"--task {task}", [*problems, *unknown])
+    return options_of({key: read[key] for key in values})
 
 
 def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:

@@ -57,6 +57,9 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
         (("--task", "ant_maz"), "did you mean ant_maze?"),
         (("--rollout", "gpu"), "--rollout gpu: must be host, xla or simd, or several"),
+        (("--task", "brax:ant", "--set", "task.options.backend=mjx2"), "must be "),
+        (("--task", "brax:ant", "--set", "task.options.backnd=mjx"), "did you mean backend?"),
+        (("--task", "brax:ant", "--set", "search.sigma=1"), "only task.options.NAME can be set here"),
     ):
         code, printed = es("bench", "rollouts", *wrong)
         assert code == 2
