@@ -165,13 +165,13 @@ def test_simd_is_what_auto_chooses_where_it_can_be_had():
     low_rank = load(MINIMAL, "compute.worker_resources.gpu=1", "search.noise.kind=low_rank")
     (warning,) = config_warnings(low_rank, POINT_MAZE, BACKENDS)
     assert warning.endswith("and only those with search.noise.kind = full")
-    no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive sort"})
+    no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive fft"})
     here = {"point_maze": no_simd}
     config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
     assert config.compute.rollout == "xla"
     (warning,) = config_warnings(config, no_simd, BACKENDS)
-    assert warning == "compute.rollout: xla is used because simd cannot run point_maze: the primitive sort"
-    with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the primitive sort; must be auto or xla"):
+    assert warning == "compute.rollout: xla is used because simd cannot run point_maze: the primitive fft"
+    with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the primitive fft; must be auto or xla"):
         load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
 
 

@@ -5,10 +5,10 @@ import pytest
 from es_service import api
 from es_service.cli.tables.evaluations import row_of
 from es_service.runs.evaluation import candidates, evaluate
-from tests.examples.sorting import Sorting
+from tests.examples.fourier import Fourier
 from workers.environments import TaskError, declared, user_task
 
-SORTING = "tests.examples.sorting:Sorting"
+FOURIER = "tests.examples.fourier:Fourier"
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 5},
     "policy": {"hidden": [4]},
@@ -56,11 +56,11 @@ def test_the_columns_that_names_are_held_against_are_those_of_a_run(tmp_path):
     ],
 )
 def test_a_name_that_would_overwrite_a_column_is_refused(monkeypatch, names, message):
-    monkeypatch.setattr(Sorting, "descriptor_names", names)
-    with pytest.raises(TaskError, match=rf"^{SORTING}: descriptor_names: {message}"):
-        user_task.describe(SORTING)
+    monkeypatch.setattr(Fourier, "descriptor_names", names)
+    with pytest.raises(TaskError, match=rf"^{FOURIER}: descriptor_names: {message}"):
+        user_task.describe(FOURIER)
 
 
 def test_names_of_columns_that_no_name_becomes_may_be_used(monkeypatch):
-    monkeypatch.setattr(Sorting, "descriptor_names", ("goal_distance", "coverage"))
-    assert user_task.describe(SORTING).descriptor_names == ("goal_distance", "coverage")
+    monkeypatch.setattr(Fourier, "descriptor_names", ("goal_distance", "coverage"))
+    assert user_task.describe(FOURIER).descriptor_names == ("goal_distance", "coverage")

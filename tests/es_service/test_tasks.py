@@ -112,18 +112,18 @@ def _loaded(task: dict, **compute):
 
 @pytest.mark.slow
 def test_the_options_of_a_run_decide_which_rollouts_can_compute_its_task():
-    name = "tests.es_service.xla_tasks:SometimesSorted"
-    chosen = {"environment": name, "options": {"sorts": True}}
+    name = "tests.es_service.xla_tasks:SometimesTransformed"
+    chosen = {"environment": name, "options": {"transforms": True}}
     config = _loaded(chosen)
     assert config.compute.rollout == "xla"
     (warning,) = config_warnings(config, task_of(config), BACKENDS)
-    assert warning.startswith(f"compute.rollout: xla is used because simd cannot run {name}: the primitive sort (at ")
-    with pytest.raises(ConfigError, match=r"simd cannot run .*: the primitive sort .*; must be auto or xla"):
+    assert warning.startswith(f"compute.rollout: xla is used because simd cannot run {name}: the primitive fft (at ")
+    with pytest.raises(ConfigError, match=r"simd cannot run .*: the primitive fft .*; must be auto or xla"):
         _loaded(chosen, rollout="simd")
-    for options in ({}, {"sorts": False}):
+    for options in ({}, {"transforms": False}):
         assert _loaded({"environment": name, "options": options}).compute.rollout == "simd"
-    with pytest.raises(ConfigError, match=r"task.options.sorts: 5 is not allowed"):
-        _loaded({"environment": name, "options": {"sorts": 5}})
+    with pytest.raises(ConfigError, match=r"task.options.transforms: 5 is not allowed"):
+        _loaded({"environment": name, "options": {"transforms": 5}})
 
 
 def test_what_a_trial_finds_of_a_task_holds_for_the_options_of_the_run():

@@ -21,10 +21,10 @@ from tests.es_service.test_environments import actions_of, same
 from workers.child import LostProcessError
 from workers.environments import TaskError
 
-DRAWN, SORTED_START = "tests.es_service.xla_tasks:Drawn", "tests.es_service.xla_tasks:SortedStart"
+DRAWN, TRANSFORMED_START = "tests.es_service.xla_tasks:Drawn", "tests.es_service.xla_tasks:TransformedStart"
 WHY = {
     DRAWN: "xla computes it in a process of its own, since simd cannot compile its step: ",
-    SORTED_START: "xla computes its resets in a process of its own, since simd cannot compile its reset: ",
+    TRANSFORMED_START: "xla computes its resets in a process of its own, since simd cannot compile its reset: ",
 }
 
 
@@ -38,7 +38,7 @@ def quietly(task: str, *given: Any, single: bool = False, **settings: Any) -> An
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
-    [DRAWN, *(pytest.param(one, marks=pytest.mark.long) for one in (SORTED_START, "brax:ant", "brax:reacher"))],
+    [DRAWN, *(pytest.param(one, marks=pytest.mark.long) for one in (TRANSFORMED_START, "brax:ant", "brax:reacher"))],
 )
 def test_an_environment_has_the_same_bits_alone_and_among_others_in_several_processes(task):
     """Environment 19 is the fourth of the second block, which has a process of its own where there are two threads."""
@@ -75,7 +75,7 @@ def test_an_environment_has_the_same_bits_alone_and_among_others_in_several_proc
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("task", [DRAWN, SORTED_START])
+@pytest.mark.parametrize("task", [DRAWN, TRANSFORMED_START])
 def test_a_warning_says_once_why_xla_computes(task):
     from workers import lanes
 

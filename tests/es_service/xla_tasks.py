@@ -40,14 +40,19 @@ class Drawn:
         return state.place[:2]
 
 
-class SortedStart:
-    """only the reset sorts"""
+def there_and_back(numbers: Any) -> Any:
+    """The numbers, after a Fourier transform and its inverse."""
+    return jnp.fft.irfft(jnp.fft.rfft(numbers), len(numbers))
+
+
+class TransformedStart:
+    """only the reset has Fourier transforms"""
 
     observation_size, action_size, episode_steps = 3, 3, 20
     descriptor_names, descriptor_bounds = ("x", "y"), ((-2.0, 2.0), (-2.0, 2.0))
 
     def reset(self, key: Any) -> Any:
-        return jnp.sort(uniforms(key, jnp.arange(3, dtype=jnp.uint32)))
+        return there_and_back(uniforms(key, jnp.arange(3, dtype=jnp.uint32)))
 
     def observe(self, state: Any) -> Any:
         return state
@@ -59,24 +64,24 @@ class SortedStart:
         return state[:2]
 
 
-class SometimesSorted(SortedStart):
-    """the step sorts if an option says so"""
+class SometimesTransformed(TransformedStart):
+    """the step has Fourier transforms if an option says so"""
 
-    options = {"sorts": (False, True)}  # noqa: RUF012
+    options = {"transforms": (False, True)}  # noqa: RUF012
 
-    def __init__(self, sorts: bool = False) -> None:
-        self.sorts = sorts
+    def __init__(self, transforms: bool = False) -> None:
+        self.transforms = transforms
 
     def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
         state = state + 0.1 * action
-        return jnp.sort(state) if self.sorts else state, state[0], state[0] > 1.1
+        return there_and_back(state) if self.transforms else state, state[0], state[0] > 1.1
 
 
-class Raising(SortedStart):
-    """the step sorts, and raises when it is traced for a batch"""
+class Raising(TransformedStart):
+    """the step has Fourier transforms, and raises when it is traced for a batch"""
 
     def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
-        state = jnp.sort(state + action)
+        state = there_and_back(state + action)
         return jax.pure_callback(_raise, state, state, vmap_method="expand_dims"), state[0], jnp.array(False)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from tests.examples.sorting import Sorting
+from tests.examples.fourier import Fourier
 
 
-class Exits(Sorting):
+class Exits(Fourier):
     """Leaves as soon as it is asked to begin."""
 
     def reset(self, key: Any) -> Any:

@@ -102,16 +102,16 @@ def test_bench_scaling_predicts_a_method_that_asks_for_policies():
 
 @pytest.mark.slow
 def test_what_simd_cannot_compile_is_said_in_one_line_and_runs_on_xla():
-    task = "tests.examples.sorting:Sorting"
+    task = "tests.examples.fourier:Fourier"
     code, printed = es("bench", "rollouts", "--task", task, "--policy", "off", "--batch", 8, "--seconds", 0)
     assert code == 0, printed
     lines = [line for line in printed.splitlines() if line.startswith(task)]
     assert [line.split()[2] for line in lines[:-1]] == ["xla"] * len({1, cores()})
-    assert "simd cannot run it: the primitive sort (at " in lines[-1]
-    assert "sorting.py:" in lines[-1]
+    assert "simd cannot run it: the primitive fft (at " in lines[-1]
+    assert "fourier.py:" in lines[-1]
     code, printed = es("bench", "rollouts", "--task", task, "--policy", "on", "--rollout", "simd", "--seconds", 0)
     assert code == 1
-    assert "simd cannot run it: the primitive sort" in printed
+    assert "simd cannot run it: the primitive fft" in printed
 
 
 def test_options_stand_for_keys(config, tmp_path):

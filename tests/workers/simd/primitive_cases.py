@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,38 +10,8 @@ import numpy as np
 from hypothesis import strategies as st
 from jax import lax
 
-LANES = 21
-Case = tuple[Callable[..., Any], list[np.ndarray]]
-"""(function of one lane, arguments [lane, ...])."""
-Draw = Callable[..., Any]
-
-
-def floats(draw: Draw, shape: tuple[int, ...], low: float = -3.0, high: float = 3.0) -> np.ndarray:
-    """Ordinary numbers, and now and then the same one twice."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    x = rng.uniform(low, high, (LANES, *shape)).astype(np.float32)
-    return np.where(rng.random(x.shape) < 0.1, np.float32(min(max(1.0, low), high)), x)
-
-
-def special(draw: Draw, shape: tuple[int, ...]) -> np.ndarray:
-    """Numbers among which are zeros, infinities and NaN."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    pool = np.array([0.0, 1.0, -1.0, 2.5, np.inf, -np.inf, np.nan, 1e30], np.float32)
-    return rng.choice(pool, (LANES, *shape))
-
-
-def integers(draw: Draw, shape: tuple[int, ...], dtype: str = "int32") -> np.ndarray:
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    wide = rng.integers(0, 2**32, (LANES, *shape)).astype(np.uint32)
-    return np.where(rng.random(wide.shape) < 0.5, wide, wide % 7).astype(np.uint32).view(dtype)
-
-
-def booleans(draw: Draw, shape: tuple[int, ...]) -> np.ndarray:
-    return np.random.default_rng(draw(st.integers(0, 2**32 - 1))).random((LANES, *shape)) < 0.5
-
-
-def shape(draw: Draw, least: int = 0, most: int = 3) -> tuple[int, ...]:
-    return tuple(draw(st.lists(st.integers(1, 4), min_size=least, max_size=most)))
+from tests.workers.simd import index_cases
+from tests.workers.simd.draws import Case, Draw, booleans, floats, integers, shape, special
 
 
 def unary(function: Callable, low: float = -3.0, high: float = 3.0) -> Callable[[Draw], Case]:
@@ -75,49 +44,10 @@ def along(function: Callable, make: Callable = floats) -> Callable[[Draw], Case]
     return case
 
 
-def gather(draw: Draw) -> Case:
-    of = shape(draw, least=1)
-    axis = draw(st.integers(0, len(of) - 1))
-    indices = np.array(draw(st.lists(st.integers(-of[axis] - 2, of[axis] + 1), min_size=1, max_size=5)))
-    mode = draw(st.sampled_from(["clip", "fill", "wrap"]))
-    make = draw(st.sampled_from([floats, integers, booleans]))
-    return lambda x: jnp.take(x, indices, axis=axis, mode=mode), [make(draw, of)]
-
-
-def gather_along(draw: Draw) -> Case:
-    of = shape(draw, least=2)
-    indices = np.random.default_rng(draw(st.integers(0, 99))).integers(0, of[-1], (*of[:-1], 2))
-    return lambda x: jnp.take_along_axis(x, indices, axis=-1), [floats(draw, of)]
-
-
-def scatter(draw: Draw) -> Case:
-    of = shape(draw, least=1)
-    indices = np.array(draw(st.lists(st.integers(-of[0] - 2, of[0] + 1), min_size=1, max_size=5, unique=True)))
-    method = draw(st.sampled_from(["set", "add", "multiply"]))
-    mode = draw(st.sampled_from(["drop", "clip"]))
-    if method == "set":
-        indices = np.array(sorted({int(np.clip(i % of[0], 0, of[0] - 1)) for i in indices}))  # order is not defined
-    update = floats(draw, (len(indices), *of[1:]))
-    return lambda x, u: getattr(x.at[indices], method)(u, mode=mode), [floats(draw, of), update]
-
-
-def segment_sum(draw: Draw) -> Case:
-    segments = np.array(draw(st.lists(st.integers(-1, 4), min_size=3, max_size=6)))
-    return lambda x: jax.ops.segment_sum(x, segments, 4), [floats(draw, (len(segments), 2))]
-
-
 def slices(draw: Draw) -> Case:
     of = shape(draw, least=1)
     at = tuple(slice(draw(st.integers(0, n - 1)), n, draw(st.integers(1, 2))) for n in of)
     return lambda x: x[at], [floats(draw, of)]
-
-
-def dynamic(draw: Draw) -> Case:
-    start, value = draw(st.integers(-3, 9)), floats(draw, (2, 3))
-    return (
-        lambda x, u: (lax.dynamic_slice(x, (start, 0), (2, 2)), lax.dynamic_update_slice(x, u, (start, start))),
-        [floats(draw, (5, 4)), value],
-    )
 
 
 def pads(draw: Draw) -> Case:
@@ -264,7 +194,7 @@ def moves(draw: Draw) -> Case:
         y = jnp.transpose(x, order)
         return (
             y.reshape(-1), jnp.flip(x, 0), jnp.concatenate([x, x], 0), jnp.stack([x, x], 0), jnp.tile(x, 2),
-            jnp.unstack(x, axis=0)[-1],
+            jnp.unstack(x, axis=0)[-1], *jnp.split(jnp.tile(x, 3), [of[-1], 2 * of[-1] + 1], -1),
             jnp.squeeze(x[None], 0), jnp.broadcast_to(x[None], (2, *of)), jnp.copy(x), jax.device_put(x),
             x + lax.broadcasted_iota(jnp.float32, of, len(of) - 1), lax.expand_dims(x, (0,)),
         )  # fmt: skip
@@ -282,6 +212,65 @@ def bits(draw: Draw) -> Case:
         )  # fmt: skip
 
     return function, [floats(draw, (3,)), integers(draw, (3,)), booleans(draw, (3,))]
+
+
+def exactly(x: jax.Array) -> jax.Array:
+    """Numbers as what a comparison tells apart: the bits of floats, of which those of a NaN do not count."""
+    return jnp.where(jnp.isnan(x), 0, lax.bitcast_convert_type(x, jnp.int32)) if x.dtype == jnp.float32 else x
+
+
+ORDERED = (special, integers, lambda draw, of: integers(draw, of, "uint32") % 5, booleans)
+
+
+def sorts(draw: Draw) -> Case:
+    of = (*shape(draw, most=1), draw(st.integers(1, 9)))
+    of = of if draw(st.booleans()) else of[::-1]
+    axis, keys = draw(st.integers(0, len(of) - 1)), draw(st.integers(1, 3))
+    operands = [draw(st.sampled_from(ORDERED))(draw, of) for _ in range(draw(st.integers(keys, 3)))]
+    return lambda *x: [exactly(one) for one in lax.sort(x, axis, num_keys=keys)], operands
+
+
+def sorts_of_constants(draw: Draw) -> Case:
+    keys = draw(st.sampled_from(ORDERED))(draw, (2, 5))[0]
+    descends = draw(st.booleans())
+    return lambda x: [exactly(one) for one in lax.sort((keys, x), 1)] + [jnp.argsort(keys, 0, descending=descends)], [
+        floats(draw, keys.shape)
+    ]
+
+
+def greatest(draw: Draw) -> Case:
+    of = (*shape(draw, most=1), draw(st.integers(1, 9)))
+    count = draw(st.integers(1, of[-1]))
+
+    def function(x):
+        found, at = lax.top_k(x, count)
+        return exactly(found), at
+
+    return function, [draw(st.sampled_from(ORDERED[:3]))(draw, of)]
+
+
+def cholesky(draw: Draw) -> Case:
+    """Positive definite matrices, since their diagonals dominate, some of whose elements are known to be 0."""
+    batch, n = shape(draw, most=1), draw(st.integers(1, 6))
+    known = np.random.default_rng(draw(st.integers(0, 99))).random((n, n)) < 0.7
+    known = known & known.T | np.eye(n, dtype=bool)
+    halves = draw(st.booleans())  # otherwise the lower triangle alone is read
+    diagonals = np.eye(n, dtype=np.float32) * floats(draw, (*batch, n, 1), 1.0, 3.0)
+    matrices = floats(draw, (*batch, n, n), -0.5, 0.5) / n + diagonals
+    return lambda a: lax.linalg.cholesky(jnp.where(known, a, 0.0), symmetrize_input=halves), [matrices]
+
+
+def triangular_solve(draw: Draw) -> Case:
+    """What must not be read is NaN."""
+    batch, n, columns = shape(draw, most=1), draw(st.integers(1, 5)), draw(st.integers(1, 3))
+    left, lower, transposed, unit = (draw(st.booleans()) for _ in range(4))
+    matrices = floats(draw, (*batch, n, n), -0.5, 0.5) + np.eye(n, dtype=np.float32) * 2.0
+    read = np.tri(n, k=-unit, dtype=bool)
+    matrices = np.where(read if lower else read.T, matrices, np.float32(np.nan))
+    right = floats(draw, (*batch, *((n, columns) if left else (columns, n))))
+    return lambda a, b: lax.linalg.triangular_solve(
+        a, b, left_side=left, lower=lower, transpose_a=transposed, unit_diagonal=unit
+    ), [matrices, right]  # fmt: skip
 
 
 CASES: dict[str, Callable[[Draw], Case]] = {
@@ -337,12 +326,16 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "select": selections,
     "arg extremes": lambda draw: (lambda x: (jnp.argmin(x, 0), jnp.argmax(x, 0)), [special(draw, (4, 2))]),
     "dots": dots,
-    "gather": gather,
-    "gather along": gather_along,
-    "scatter": scatter,
-    "segment sum": segment_sum,
+    "gather": index_cases.gather,
+    "gather along": index_cases.gather_along,
+    "gather by data": index_cases.gather_by_data,
+    "places by data": index_cases.places_by_data,
+    "scatter": index_cases.scatter,
+    "scatter by data": index_cases.scatter_by_data,
+    "updates by data": index_cases.updates_by_data,
+    "segment sum": index_cases.segment_sum,
     "slices": slices,
-    "dynamic": dynamic,
+    "dynamic": index_cases.dynamic,
     "pads": pads,
     "moves": moves,
     "choices": choices,
@@ -360,5 +353,10 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "extremes": extremes,
     "constant integers": constant_integers,
     "calls": calls,
+    "sorts": sorts,
+    "sorts of constants": sorts_of_constants,
+    "greatest": greatest,
+    "cholesky": cholesky,
+    "triangular solve": triangular_solve,
     "bits": bits,
 }

@@ -1,6 +1,7 @@
 """64-bit Arm gives the bits of x86-64: primitives, whole episodes, and a run's digest, by code that qemu runs.
 
-Tests beside this one take targets of Arm, too: operations, noise, gradients, policies, recipes, steps of each task.
+Primitives are compared at every width of x86-64 as well. Tests beside this one take targets of Arm, too: operations,
+noise, gradients, policies, recipes, steps of each task.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from es_service.store.digest import digest_parts
 from tests import helpers
 from tests.workers.simd.emulated import arm_targets
 from tests.workers.simd.primitive_cases import CASES
-from tests.workers.simd.rollouts import arguments, targets, task_spec
+from tests.workers.simd.rollouts import arguments, every_target, targets, task_spec
 from workers.environments import make_environment
 from workers.simd.backend.target import Target
 from workers.simd.episodes import compiled, kernel, rollout, variation
@@ -51,7 +52,7 @@ def same_words(found: Any, wanted: Any, what: str) -> None:
 
 
 def every_primitive(draw: Any, target: Target) -> None:
-    """One kernel of all cases together, on Arm, on this processor and in NumPy."""
+    """One kernel of all cases together, for a target, for the widest vectors of this processor and in NumPy."""
     functions, given_ = zip(*(case(draw) for case in CASES.values()), strict=True)
 
     def function(given_: Any) -> Any:
@@ -74,16 +75,21 @@ def as_words(tree: Any) -> np.ndarray:
     return np.concatenate([x.astype(np.uint32) if x.itemsize < 4 else x.copy().view(np.uint32) for x in rows])
 
 
+ON_EVERY_TARGET = pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+
+
 @pytest.mark.slow
-@ON_ARM
+@ON_EVERY_TARGET
 @settings(GENTLE, max_examples=2)
 @given(data=st.data())
-def test_every_primitive_has_the_bits_of_x86_and_of_its_reference(data: st.DataObject, target: Target) -> None:
+def test_every_primitive_has_the_same_bits_on_every_target_and_in_its_reference(
+    data: st.DataObject, target: Target
+) -> None:
     every_primitive(data.draw, target)
 
 
 @pytest.mark.long
-@ON_ARM
+@ON_EVERY_TARGET
 @settings(GENTLE, max_examples=12)
 @given(data=st.data())
 def test_so_it_has_for_more_shapes_and_values(data: st.DataObject, target: Target) -> None:

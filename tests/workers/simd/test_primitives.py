@@ -78,8 +78,16 @@ def test_every_primitive_has_a_case() -> None:
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        (lambda x: jnp.sort(x), "the primitive sort"),
-        (lambda x: jnp.take(x, jnp.argmax(x)), "gather with indices that depend on the state"),
+        (lambda x: jnp.linalg.inv(jnp.outer(x, x)), "the primitive lu"),
+        (
+            lambda x: jnp.take(jnp.tile(x, 171), x[0].astype(jnp.int32)),
+            r"gather with indices that depend on the state, among 513 places \(at most 512\)",
+        ),
+        (
+            lambda x: jnp.zeros((30, 30)).at[x[0].astype(jnp.int32), x[1].astype(jnp.int32)].add(x[2]),
+            r"scatter-add with indices that depend on the state, among 900 places \(at most 512\)",
+        ),
+        (lambda x: jnp.sort(jnp.tile(x, 300)), r"sort of 900 numbers, by 20,958 comparisons \(at most 20,000\)"),
         (lambda x: x.astype(jnp.float16).astype(jnp.float32), "values of type float16"),
         (lambda x: (x.astype(jnp.int32).astype(jnp.uint8) + 1).astype(jnp.float32), "add of uint8"),
         (

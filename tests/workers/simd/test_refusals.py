@@ -18,6 +18,7 @@ from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.backend import emit
 from workers.simd.episodes import check, noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.frontend.primitives.indexing import MOST_CHOICES
 from workers.simd.frontend.primitives.registry import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -44,11 +45,11 @@ def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
 
 def test_why_a_task_cannot_have_it():
     assert rollout.why_not(SHIPPED["point_maze"]) == ""
-    sorting = describe_environment("tests.examples.sorting:Sorting")
-    assert "the primitive sort (at " in rollout.why_not(sorting)
+    assert "the primitive fft (at " in rollout.why_not(describe_environment("tests.examples.fourier:Fourier"))
 
 
-MOVES = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+TABLE = jnp.sin(jnp.arange(2.0 * MOST_CHOICES + 2.0)).reshape(-1, 2)
+"""One row more than indices that depend on data may choose from."""
 
 
 class Walk:
@@ -87,24 +88,41 @@ def _replaced(array: Any, index: Any) -> Any:
     return jnp.where(jnp.arange(len(array)) == index, 5.0, array)
 
 
+def _index(state: Any) -> Any:
+    return (400.0 * state["x"][0]).astype(jnp.int32)
+
+
+def _many(state: Any) -> Any:
+    return jnp.sin(1000.0 * state["x"][0] + jnp.arange(1000.0))
+
+
+def _system(state: Any) -> Any:
+    return jnp.array([[2.0, 0.0], [0.0, 3.0]]) + state["x"][1]
+
+
 @pytest.mark.parametrize(
     ("move", "advice", "instead"),
     [
         (_jax_random, "es_service.protocol.noise.uniforms(key, counters)", _uniforms),
         (
-            lambda s, a: MOVES[jnp.argmax(a)],
+            lambda s, a: TABLE[_index(s)],
             "jax.nn.one_hot(index, len(array)) @ array",
-            lambda s, a: _chosen(MOVES, jnp.argmax(a)),
+            lambda s, a: _chosen(TABLE, _index(s)),
         ),
         (
-            lambda s, a: s["x"].at[jnp.argmax(a[:2])].set(5.0),
+            lambda s, a: TABLE[:, 0].at[_index(s)].set(5.0)[99:101],
             "jnp.where(jnp.arange(len(array)) == index, x, array)",
-            lambda s, a: _replaced(s["x"], jnp.argmax(a[:2])),
+            lambda s, a: _replaced(TABLE[:, 0], _index(s))[99:101],
         ),
         (
-            lambda s, a: jnp.sort(s["x"] + a[:2]),
-            "jnp.minimum and jnp.maximum",
-            lambda s, a: jnp.stack([(s["x"] + a[:2]).min(), (s["x"] + a[:2]).max()]),
+            lambda s, a: jnp.sort(_many(s))[::999],
+            "the least and the greatest are jnp.min and jnp.max",
+            lambda s, a: jnp.stack([_many(s).min(), _many(s).max()]),
+        ),
+        (
+            lambda s, a: jnp.linalg.solve(_system(s), a[:2]),
+            "factor positive definite matrices by jnp.linalg.cholesky",
+            lambda s, a: jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(_system(s)), a[:2]),
         ),
     ],
 )
@@ -120,7 +138,7 @@ def test_a_refusal_says_what_the_task_can_do_instead_and_then_it_is_compiled(
     if move is not _jax_random:  # which draws other numbers
         state = Walk().reset(jnp.zeros(4, jnp.uint32)) | {"x": jnp.array([0.25, -0.5])}
         action = jnp.array([0.1, 0.7, -0.3, 0.2])
-        np.testing.assert_allclose(instead(state, action), move(state, action))
+        np.testing.assert_allclose(instead(state, action), move(state, action), rtol=1e-6)
 
 
 def test_a_key_of_jax_in_the_state_is_refused_with_what_to_use_instead(monkeypatch: pytest.MonkeyPatch):
@@ -217,8 +235,7 @@ def test_a_fault_of_the_compiler_asks_for_a_report_and_an_unsupported_task_does_
     def broken(*_: Any) -> Any:
         raise KeyError("add")
 
-    sorting = rollout.why_not(describe_environment("tests.examples.sorting:Sorting"))
-    assert "report" not in sorting
+    assert "report" not in rollout.why_not(describe_environment("tests.examples.fourier:Fourier"))
     monkeypatch.setitem(PRIMITIVES, "add", broken)
     why = rollout.why_not(SHIPPED["point_maze"])
     assert why.startswith("a fault of es-service's compiler, please report it (KeyError: 'add')")

@@ -14,7 +14,11 @@ _ONE_HOT = (
     "action is such a vector, action @ array"
 )
 _UPDATE = "instead of array.at[index].set(x) write jnp.where(jnp.arange(len(array)) == index, x, array)"
-_FORMULA = "write small systems out, or solve them by a fixed number of iterations"
+_FORMULA = (
+    "factor positive definite matrices by jnp.linalg.cholesky, write other small systems out, or solve them by a fixed "
+    "number of iterations"
+)
+_FEWER = "sort fewer numbers in a row; the least and the greatest are jnp.min and jnp.max"
 WAYS_ROUND = {
     "gather": _ONE_HOT,
     "dynamic_slice": _ONE_HOT,
@@ -22,10 +26,11 @@ WAYS_ROUND = {
     "scatter": _UPDATE,
     "scatter-add": _UPDATE.replace(".set(x)", ".add(x)").replace("x, array", "array + x, array"),
     "scatter-mul": _UPDATE.replace(".set(x)", ".multiply(x)").replace("x, array", "array * x, array"),
-    "sort": "order a few numbers by jnp.minimum and jnp.maximum of pairs of them",
-    **dict.fromkeys(("cholesky", "lu", "qr", "eigh", "svd", "triangular_solve"), _FORMULA),
+    "sort": _FEWER,
+    "top_k": _FEWER,
+    **dict.fromkeys(("lu", "qr", "eigh", "svd"), _FORMULA),
 }
-"""Primitive that is not supported, or not with data -> what a task can do instead."""
+"""Primitive that is not supported, or not for arrays as large -> what a task can do instead."""
 
 
 def way_round(primitive: str) -> str:

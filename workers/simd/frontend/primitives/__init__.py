@@ -5,7 +5,16 @@ outputs. `equation` has the primitive's parameters and the types of its inputs a
 UnsupportedError for cases that it does not support.
 """
 
-from workers.simd.frontend.primitives import arithmetic, choices, control, reductions, structure
+from workers.simd.frontend.primitives import (
+    arithmetic,
+    choices,
+    control,
+    indexing,
+    linear,
+    reductions,
+    sorting,
+    structure,
+)
 from workers.simd.frontend.primitives.registry import PRIMITIVES
 
-__all__ = ["PRIMITIVES", "arithmetic", "choices", "control", "reductions", "structure"]
+__all__ = ["PRIMITIVES", "arithmetic", "choices", "control", "indexing", "linear", "reductions", "sorting", "structure"]

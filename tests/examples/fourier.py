@@ -1,4 +1,4 @@
-"""A task that our compiler cannot compile, because it sorts: it runs on xla."""
+"""A task that our compiler cannot compile, because it has a Fourier transform: it runs on xla."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from es_service.protocol.noise import uniforms
 
 
-class Sorting:
-    """three numbers are to come near to each other; the reward sorts them"""
+class Fourier:
+    """three numbers are to come near to each other; the reward is the amplitude of what they have not in common"""
 
     observation_size = 3
     action_size = 3
@@ -26,8 +26,8 @@ class Sorting:
 
     def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
         state = jnp.clip(state + 0.1 * action, -2.0, 2.0)
-        in_order = jnp.sort(state)
-        return state, in_order[0] - in_order[2], jnp.array(False)
+        amplitude = jnp.abs(jnp.fft.rfft(state)[1])
+        return state, -amplitude, jnp.array(False)
 
     def descriptor(self, state: Any) -> Any:
         return jnp.stack([state.min(), state.max()])
