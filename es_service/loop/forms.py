@@ -49,7 +49,7 @@ _MORE = {
     GEOMETRY_PART: {"shape_B": INTEGER, "centroid_C_B": REAL, "counts_samples": BOOL},
     CELL_PREFIX: {"samples": INTEGER},
 }
-"""The same for arrays that it may have; a centre has those of its step, of any kind."""
+"""The same for arrays that it may have; a centre has any others, such as those of a user's search."""
 _ALWAYS = (COUNTERS, OBSERVATIONS, WEIGHT, BEST, centre_part(0))
 _ANY = "biuf"
 _AXES = re.compile("(?<=_)[A-Z0-9](?=_|$)")
@@ -67,6 +67,8 @@ class Sizes(NamedTuple):
     """Cells of the map along each dimension, or of a cvt map; None without one."""
     bounds: tuple[tuple[float, float], ...]
     """(low, high) of each dimension of the map."""
+    step: Mapping[str, str] = {}
+    """Name of an array of a centre's step -> the kinds that it may have."""
 
 
 def problem(part: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
@@ -74,9 +76,11 @@ def problem(part: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
     kind = next((prefix for prefix in _NUMBERED if part.startswith(prefix)), part)
     if kind not in _KINDS:
         return ""
-    more = _MORE.get(kind, {}) | (dict.fromkeys(arrays, _ANY) if kind == CENTRE_PREFIX else {})
+    needed, more = _KINDS[kind], _MORE.get(kind, {})
+    if kind == CENTRE_PREFIX:
+        needed, more = {**needed, **sizes.step}, dict.fromkeys(arrays, _ANY)
     lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions, "2": 2}
-    found = array_problem(arrays, _KINDS[kind], more, lengths) or _problem_of_values(part, kind, arrays, sizes)
+    found = array_problem(arrays, needed, more, lengths) or _problem_of_values(part, kind, arrays, sizes)
     return f"{part} {found}" if found else ""
 
 

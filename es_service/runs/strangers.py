@@ -13,9 +13,10 @@ import numpy as np
 
 from es_service.config.keys import policy_of
 from es_service.errors import StoreError
-from es_service.loop.forms import Sizes, missing, problem
+from es_service.loop.forms import INTEGER, REAL, Sizes, missing, problem
 from es_service.loop.parts import Parts
 from es_service.protocol.messages import PolicySpec
+from es_service.search.steps import STEPS
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 
@@ -40,7 +41,9 @@ def sizes_of(meta: RunMeta) -> Sizes:
     dimensions, has_map = len(meta.task["descriptor_names"]), meta.constants["map.enabled"]
     cells = tuple(meta.constants["map.cells"] or ()) if has_map else None
     bounds = tuple((low, high) for low, high in meta.constants["map.bounds"] or ()) if has_map else ()
-    return Sizes(policy_spec(meta).parameters, meta.task["observation_size"], dimensions, cells, bounds)
+    step, kinds = STEPS.get(meta.constants.get("search.step.kind") or ""), {"i": INTEGER, "f": REAL}
+    of_step = {} if step is None else {name: kinds[array.dtype.kind] for name, array in step.fresh(1).items()}
+    return Sizes(policy_spec(meta).parameters, meta.task["observation_size"], dimensions, cells, bounds, of_step)
 
 
 def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:

@@ -79,6 +79,7 @@ class Constants(Form):
     policy__observation_clip: float | None
     policy__observation_normalization: bool
     search__algorithm: str
+    search__step__kind: str | None = None
     map__enabled: bool
     map__cells: list[Size] | None = None
     map__bounds: list[tuple[Finite, Finite]] | None = None

@@ -129,6 +129,7 @@ def _arrays(folder: Path, rng: random.Random) -> str:
     """The content of a part of the state."""
     with database(folder / "run.db") as connection:
         rows = connection.execute("SELECT part, generation, payload FROM state WHERE payload != x''").fetchall()
+        rows = [row for row in rows if decode_part(row[2])]
         kinds = sorted({row[0].rstrip("0123456789") for row in rows})
         kind = rng.choice(kinds)
         part, at, payload = rng.choice([row for row in rows if row[0].startswith(kind)])

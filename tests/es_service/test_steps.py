@@ -7,8 +7,13 @@ import pytest
 
 from es_service import api
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, PlainStep
+from es_service.errors import StoreError
+from es_service.loop.parts import centre_to_arrays
+from es_service.runs.strangers import policy_spec, require_forms
 from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import CentreState
 from es_service.search.steps import STEPS, restarted
+from tests.es_service.store_examples import CONSTANTS, meta
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -89,3 +94,16 @@ def test_every_method_with_a_gradient_takes_every_part(algorithm, tmp_path):
     run = api.run(config, tmp_path / "run").run
     assert run.generation == 2
     assert run.history.update_norm.iloc[-1] > 0
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_a_stored_centre_has_the_arrays_of_its_step(tmp_path, kind):
+    run = meta(constants=CONSTANTS | {"search.step.kind": kind})
+    size = policy_spec(run).parameters
+    arrays = centre_to_arrays(CentreState(np.zeros(size, np.float32), STEPS[kind].fresh(size)))
+    require_forms(tmp_path, run, {"centre_0": arrays | {"of_user_D": arrays["centre_D"]}})
+    for name, values in STEPS[kind].fresh(size).items():
+        without = {other: array for other, array in arrays.items() if other != name}
+        for wrong, what in ((without, "lacks"), (arrays | {name: values.astype(str)}, "has")):
+            with pytest.raises(StoreError, match=f"centre_0 {what} .*array .?{name}"):
+                require_forms(tmp_path, run, {"centre_0": wrong})
