@@ -80,7 +80,7 @@ def _moments(host: Episodes, shift_O: Any) -> Moments:
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
     said = (sums, squares, host.fitness.reshape(-1, 1), host.descriptor.reshape(len(sums), -1))
-    valid = np.logical_and.reduce([np.isfinite(x).all(axis=1) for x in said])
+    valid = np.isfinite(np.concatenate(said, axis=1)).all(axis=1)
     count = float(host.steps.reshape(-1)[valid].sum())
     if count == 0.0:
         return Moments(0.0, np.zeros(size), np.zeros(size))

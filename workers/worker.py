@@ -236,6 +236,8 @@ def lane_name(spec: WorkerSpec, work: Work, lane: int) -> str:
 
 def _with_failures(spec: WorkerSpec, work: Work, episodes: Episodes, result: EpisodesResult) -> EpisodesResult:
     """The result of a chunk with the first of its failed episodes by name."""
+    if not episodes.failures:
+        return result
     told = episodes.failures[:FAILURES_TOLD]
     return replace(result, failures=tuple(f"{lane_name(spec, work, lane)} {text}" for lane, text in told))
 
@@ -279,7 +281,9 @@ def _ids(chunks: Sequence[Chunk], size: int) -> Any:
 
 def _split(episodes: Episodes, size: int) -> list[Episodes]:
     """Episodes of several chunks as those of each, `size` along the first axis."""
-    return [episodes.part(slice(first, first + size)) for first in range(0, len(episodes.fitness), size)]
+    if (count := len(episodes.fitness)) == size:
+        return [episodes]
+    return [episodes.part(slice(first, first + size)) for first in range(0, count, size)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

@@ -13,6 +13,9 @@ first episodes, the second one how long with compiled code on disk.
 
 `--policies` compares, with simd, as many explicit policies, whose parameters are sent to the workers in every call,
 with the perturbed ones, whose parameters the workers make.
+
+`--looking` measures what it costs to look at observations and results for NaN and infinities: a worker in this process,
+one chunk a call, by turns with one that does not look; medians of the rounds' ratios (`--rounds 31 --seconds 1`).
 """
 
 from __future__ import annotations
@@ -24,11 +27,14 @@ import os
 import statistics
 import tempfile
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import jax.numpy as jnp
 import numpy as np
 
 from es_service import api
@@ -38,9 +44,12 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.evaluator import Evaluator
-from es_service.protocol.messages import EpisodesResult, TrainingChunk, with_subject
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk, WorkerSpec, with_subject
 from tests.helpers import centre
+from workers.environments import Environment
+from workers.episode import EpisodeSteps, episode_steps
 from workers.policies.policy import initial_parameters
+from workers.worker import make_worker
 
 ROUNDS = 5
 PAIRS = {"point_maze": 4096}
@@ -73,12 +82,14 @@ def resident_mib(pid: int) -> float:
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def config_of(task: str) -> RunConfig:
+def config_of(task: str, hidden: list[int] | None = None) -> RunConfig:
     maze = task == "point_maze"
+    if hidden is None:
+        hidden = [64, 64] if maze else [256, 256]
     return api.load_config(
         {
             "task": {"environment": task, "episode_steps": None if maze else ANT_STEPS},
-            "policy": {"hidden": [64, 64] if maze else [256, 256]},
+            "policy": {"hidden": hidden},
             "search": {"algorithm": "es", "pairs": PAIRS.get(task, ANT_PAIRS)},
             "budget": {"generations": 1},
         }
@@ -147,6 +158,65 @@ def compare(task: str, seconds: float, rounds: int, *, threads: bool) -> dict[st
     }
 
 
+@contextmanager
+def not_looking() -> Iterator[None]:
+    """Inside the block, JAX tasks are compiled and run without a look at what is not finite."""
+
+    def blind_steps(environment: Environment, spec: WorkerSpec, **kind: Any) -> EpisodeSteps:
+        steps = episode_steps(environment, spec, **kind | {"finds_faults": False})
+
+        def advance(carry: Any, mean_O: Any, x_O: Any, *others: Any) -> Any:
+            return steps.advance(carry, mean_O, jnp.zeros_like(x_O), *others)
+
+        return steps._replace(advance=advance)
+
+    with (
+        patch("workers.simd.episodes.program.episode_steps", blind_steps),
+        patch("workers.rollout.episode_steps", blind_steps),
+        patch("workers.simd.episodes.compiled._all_finite", lambda words: True),
+        patch("workers.rollouts.jax_tasks.judged", lambda functions, spec: functions),
+    ):
+        yield
+
+
+def compare_looking(task: str, hidden: list[int] | None, rollout: str, seconds: float, rounds: int) -> dict[str, Any]:
+    """A row: for training and evaluation, the cost of looking in percent, the median of the rounds and the quartiles.
+
+    Each round makes both workers anew, since where their code and memory lie changes their speed by some percent. Calls
+    are by turns, in seconds of this thread.
+    """
+    config = config_of(task, hidden)
+    spec = replace(worker_spec(config, task_of(config)), rollout=rollout)
+    size, blocks = spec.policy.widths[0], {True: nullcontext, False: not_looking}
+    point = centre(initial_parameters(spec.policy, "unit_columns", 0), sigma=0.02, observation_size=size)
+    chunks = {"training": TrainingChunk(1, 0), "evaluation": EvaluationChunk(1, 0, 16)}
+    ratios, unlooked_s = ({kind: [] for kind in chunks} for _ in range(2))
+    for _ in range(rounds):
+        runs = {}
+        for looks, block in blocks.items():
+            with block():
+                runs[looks] = make_worker(spec)
+        for kind, chunk in chunks.items():
+            work, durations, end = with_subject(point, [chunk]), {True: [], False: []}, time.perf_counter() + seconds
+            while len(durations[True]) < 3 or time.perf_counter() < end:
+                for looks, block in blocks.items():
+                    with block():
+                        start = time.thread_time()
+                        runs[looks](work)
+                        durations[looks].append(time.thread_time() - start)
+            looked, unlooked = (statistics.median(durations[looks]) for looks in blocks)
+            ratios[kind].append(looked / unlooked)
+            unlooked_s[kind].append(unlooked)
+    row: dict[str, Any] = {"task": task, "hidden": spec.policy.widths[1:-1], "rollout": rollout}
+    for kind in chunks:
+        row |= {
+            f"{kind}_us": round(1e6 * statistics.median(unlooked_s[kind])),
+            f"{kind}_percent": round(100 * (statistics.median(ratios[kind]) - 1), 2),
+            f"{kind}_quartiles": [round(100 * (x - 1), 2) for x in statistics.quantiles(ratios[kind], n=4)[::2]],
+        }
+    return row
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--tasks", nargs="+", default=["point_maze", "ant_maze", "ant_trap", "brax:ant"])
@@ -154,10 +224,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--threads", action="store_true", help="workers of simd are threads of one process")
     parser.add_argument("--policies", action="store_true", help="explicit policies beside perturbed ones, with simd")
+    parser.add_argument("--looking", nargs="+", metavar="ROLLOUT", help="what looking costs with these rollouts")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as empty:
         os.environ["XDG_CACHE_HOME"] = empty
         for task in arguments.tasks:
+            if arguments.looking:
+                for rollout, hidden in itertools.product(arguments.looking, ([], None)):
+                    row = compare_looking(task, hidden, rollout, arguments.seconds, arguments.rounds)
+                    print(json.dumps(row), flush=True)
+                continue
             if arguments.policies:
                 row = compare_policies(task, arguments.seconds, arguments.rounds)
             else:

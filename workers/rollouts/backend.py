@@ -9,6 +9,8 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
 from es_service.protocol.recipes import FloatArray, Recipes
@@ -34,14 +36,15 @@ class FailedEpisode(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """Results of an episode, or of a batch of episodes with the leading axes of the caller."""
+    """Results of an episode, or of a batch of episodes with the leading axes of the caller.
+
+    Those before `goal_distance` are finite in an episode without a fault.
+    """
 
     fitness: Any
     returns: Any
     descriptor: Any
     steps: Any
-    goal_distance: Any
-    """[..., 2]: distance to the goal at the end, and the least distance during the episode."""
     shifted_sum_O: Any
     """Sum over counted steps of (observation - mean of the statistics), float32; empty in evaluations, which do not
     update the statistics.
@@ -51,6 +54,8 @@ class Episodes(NamedTuple):
     observations must be less than a thousand of their standard deviations from 0."""
     shifted_square_sum_O: Any
     """Sum over counted steps of (observation - mean of the statistics) squared, float32; empty in evaluations."""
+    goal_distance: Any
+    """[..., 2]: distance to the goal at the end, and the least distance during the episode; NaN without a goal."""
     trace_T_B: Any
     """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
     the episode's maximal number of steps, or at its end if it ended before."""
@@ -62,7 +67,7 @@ class Episodes(NamedTuple):
     fault: Any = None
     """[..., 2] int32 of a JAX task: the step, counted from 1, in which something first was not finite, and what: the
     number of the observation on which the policy acted, or else BAD_REWARD for the return; NO_FAULT if nothing was
-    before the last step. None if the rollout has looked itself."""
+    before the last step. None if the rollout has looked itself, or if no result calls for a look."""
     failures: tuple[FailedEpisode, ...] = ()
     """Invalid episodes by name."""
 
@@ -86,6 +91,11 @@ class Episodes(NamedTuple):
             outputs={name: array for name, array in self.outputs.items() if name not in of_steps},
             of_steps=dict(of_steps),
         )
+
+
+def no_faults(lanes: int) -> np.ndarray:
+    """`Episodes.fault` [L, 2] of episodes without one."""
+    return np.tile(np.array([0, NO_FAULT], np.int32), (lanes, 1))
 
 
 def observation_text(number: int, step: int) -> str:

@@ -38,7 +38,10 @@ def judged(functions: ChunkFunctions, spec: WorkerSpec) -> ChunkFunctions:
         """`of`, which has reset keys, and whether lanes are wanted, as arguments with these numbers."""
 
         def run(*given: Any) -> Episodes:
-            return _judged(of(*given), given[reset_keys], True if wanted is None else given[wanted], spec)
+            episodes = of(*given)
+            if episodes.fault is None:
+                return episodes
+            return _judged(episodes, given[reset_keys], True if wanted is None else given[wanted], spec)
 
         return Compilable(run, of.compile)
 
@@ -51,11 +54,6 @@ def judged(functions: ChunkFunctions, spec: WorkerSpec) -> ChunkFunctions:
 
 def _judged(episodes: Episodes, reset_keys: Any, is_wanted: Any, spec: WorkerSpec) -> Episodes:
     episodes = episodes.map(np.asarray)
-    results = (episodes.fitness, episodes.returns, episodes.descriptor)
-    if episodes.fault is None:
-        if all(np.isfinite(array).all() for array in results):
-            return episodes
-        episodes = episodes._replace(fault=np.full((*episodes.steps.shape, 2), NO_FAULT))
     step, number = episodes.fault[..., 0], episodes.fault[..., 1]
     fitness, returns = (
         np.where(number < BAD_REWARD, np.float32(np.nan), x) for x in (episodes.fitness, episodes.returns)

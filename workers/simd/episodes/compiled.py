@@ -18,7 +18,8 @@ from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, WorkerSp
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable
 from workers.environments import Environment
-from workers.episode import Carry, Episodes
+from workers.episode import Carry
+from workers.rollouts.backend import Episodes, no_faults
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, Words, aligned, filled, pack, require, unpack, words_of
@@ -49,6 +50,8 @@ class EpisodeKernel:
     """Shapes and dtypes of a carry."""
     episode_words: int
     """Number of words of an episode's result."""
+    finite_words: int
+    """Number of words, the first of these, that are finite in an episode without a fault."""
     of_steps: dict[str, range]
     """Words of a carry that have an output of each step, by its name."""
     _call: Callable[..., None]
@@ -88,9 +91,15 @@ class EpisodeKernel:
         return self.results(carries[:, -self.episode_words :], lanes).with_steps(self._steps_kept(kept, lanes))
 
     def results(self, words: Words, lanes: int) -> Episodes:
-        """The results of episodes, [L], of the last words of their carries, [block, word, lane]."""
+        """The results of episodes, [L], of the last words of their carries, [block, word, lane].
+
+        A kernel that finds no faults only leaves a trace of them, a result that is not finite, for other reasons too.
+        `Episodes.fault` says that there are none then; it is None if all results are finite.
+        """
         leaves, structure = jax.tree.flatten(self.carry.episode)
         episodes = structure.unflatten(unpack(words, leaves, lanes))
+        if episodes.fault is None and not _all_finite(words[:, : self.finite_words]):
+            episodes = episodes._replace(fault=no_faults(lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return episodes
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
@@ -182,6 +191,10 @@ class EpisodeKernel:
         return carries, go
 
 
+def _all_finite(words: Words) -> bool:
+    return np.count_nonzero(np.isfinite(words.view(np.float32))) == words.size  # in half the time of `all`
+
+
 def compile_episodes(
     environment: Environment,
     spec: WorkerSpec,
@@ -215,6 +228,7 @@ def compile_episodes(
     program = write_episodes(environment, spec, inputs_O, target, **kind)
     lanes = 2 * spec.chunk_pairs if training else EVALUATION_EPISODES_PER_CHUNK
     begin = compile_resets(program.steps.begin, target, folder, lanes, check_resets)
+    episode = program.carry.episode
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 
     def kernel(native: Native) -> EpisodeKernel:
@@ -229,7 +243,8 @@ def compile_episodes(
             alive_word=program.alive_word,
             of_steps=program.of_steps,
             carry=program.carry,
-            episode_words=sum(map(words_of, jax.tree.leaves(program.carry.episode))),
+            episode_words=sum(map(words_of, jax.tree.leaves(episode))),
+            finite_words=sum(map(words_of, episode[: Episodes._fields.index("goal_distance")])),
             _call=native.function(*signature),
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
-from workers.rollouts.backend import NO_FAULT, Episodes
+from workers.rollouts.backend import Episodes, no_faults
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.backend.words import aligned, require
@@ -91,14 +91,14 @@ def make_training_rollout(
             same bits, which is called in its place; its `compile` takes a kernel.
     """
     with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
-    kernels, finding = (_Kernels(environment, spec, training=True, finds_faults=finds) for finds in (False, True))
+    kernels = _Kernels(environment, spec, training=True)
 
     def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
         kernel, weights = kernels.for_centre(centre_D, mean_O)
         by_episode = []
 
         def again(lane_M: np.ndarray, *keys_L: np.ndarray) -> Episodes:
-            finder, weights = finding.for_centre(centre_D, mean_O)
+            finder, weights = kernels.for_centre(centre_D, mean_O, finds_faults=True)
             keys_M = (keys[lane_M] for keys in keys_L)
             return finder.run(weights, unit, mean_O, std_O, noise_keys_P[lane_M[::2] // 2], *keys_M)
 
@@ -109,13 +109,10 @@ def make_training_rollout(
             episodes = kernel.run(weights, *given) if elsewhere is None else elsewhere(kernel, centre_D, *given)
             by_episode.append(with_faults(episodes, lambda lane_M, keys_L=keys_L: again(lane_M, *keys_L), pairs=True))
         axes = (len(noise_keys_P), 2, spec.episodes_per_member)
-        if any(episodes.fault is not None for episodes in by_episode):  # then all have some, to be put together
-            nothing = _no_faults(2 * len(noise_keys_P))
-            by_episode = [
-                episodes._replace(fault=nothing) if episodes.fault is None else episodes for episodes in by_episode
-            ]
         if len(by_episode) == 1:
             return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), by_episode[0])
+        if any(episodes.fault is not None for episodes in by_episode):  # then all have some, to be put together
+            by_episode = [x if x.fault is not None else x._replace(fault=no_faults(len(x.steps))) for x in by_episode]
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]), *by_episode)
 
     def compile_for(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
@@ -130,15 +127,15 @@ def make_training_rollout(
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
     with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
-    kernels, finding = (_Kernels(environment, spec, training=False, finds_faults=finds) for finds in (False, True))
+    kernels = _Kernels(environment, spec, training=False)
 
     def rollout(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
-        def run(kernels: _Kernels, keys_E: np.ndarray, wanted_E: np.ndarray | None = None) -> Episodes:
-            kernel, weights = kernels.for_centre(centre_D, mean_O)
+        def run(keys_E: np.ndarray, wanted_E: np.ndarray | None = None, *, finds_faults: bool = False) -> Episodes:
+            kernel, weights = kernels.for_centre(centre_D, mean_O, finds_faults=finds_faults)
             return kernel.run(weights, 0.0, mean_O, std_O, None, keys_E, keys_E, wanted_E)
 
-        episodes = run(kernels, reset_keys_E, wanted_E)
-        return with_faults(episodes, lambda lane_M: run(finding, reset_keys_E[lane_M]), wanted_E)
+        episodes = run(reset_keys_E, wanted_E)
+        return with_faults(episodes, lambda lane_M: run(reset_keys_E[lane_M], finds_faults=True), wanted_E)
 
     def compile_for(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
         kernels.fitting(mean_O).begin.compile(reset_keys_E)
@@ -150,10 +147,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
     lanes."""
     with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
-    kernels, finding = (
-        _Kernels(environment, spec, training=False, per_lane_weights=True, finds_faults=finds)
-        for finds in (False, True)
-    )
+    kernels = _Kernels(environment, spec, training=False, per_lane_weights=True)
     make = make_variation()
 
     def rollout(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
@@ -176,7 +170,8 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
             given = mean_L_O[lane_M], std_L_O[lane_M], None, keys_M, keys_M
             return kernel.run(addresses_N[policy_L[lane_M]], 0.0, *given)
 
-        return with_faults(run(kernel, slice(None)), lambda lane_M: run(finding.fitting(mean_L_O), lane_M))
+        finder = partial(kernels.fitting, mean_L_O, finds_faults=True)
+        return with_faults(run(kernel, slice(None)), lambda lane_M: run(finder(), lane_M))
 
     def compile_for(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernels.fitting(mean_L_O).begin.compile(reset_keys_L)
@@ -206,10 +201,10 @@ def _with_faults(
     pairs: bool = False,
     allow_infeasible: bool = False,
 ) -> Episodes:
-    """Episodes [L] with `Episodes.fault`, which is None if no result calls for a look.
+    """Episodes [L] of a kernel that finds no faults, with those of its traces of faults.
 
-    To look for faults would cost small policies some percent of their speed. A kernel only leaves a trace of them, a
-    result that is not finite, for other reasons too. Episodes with such a result run again.
+    To look for faults would cost small policies some percent of their speed, so only episodes whose results are not
+    finite run again.
 
     Args:
         again: function from lanes [M] to their episodes [M], by a kernel that finds faults.
@@ -217,19 +212,13 @@ def _with_faults(
         pairs: whether neighbouring lanes can only run together.
         allow_infeasible: whether a fitness of -inf alone is no reason to look.
     """
-    results = (episodes.fitness, episodes.returns, episodes.descriptor)
-    sums = (episodes.shifted_sum_O, episodes.shifted_square_sum_O)
-    if all(np.isfinite(array).all() for array in (*results, *sums)):
+    if episodes.fault is None:
         return episodes
-
-    def not_finite(arrays: Sequence[np.ndarray]) -> np.ndarray:
-        rows = [array.reshape(len(episodes.steps), -1) for array in arrays]
-        return ~np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows])
-
-    is_suspect_L = not_finite(results)
+    results = (episodes.fitness[:, None], episodes.returns[:, None], episodes.descriptor)
+    is_suspect_L = ~np.isfinite(np.concatenate(results, axis=1)).all(axis=1)
     if allow_infeasible:
         is_suspect_L &= episodes.fitness != -np.inf
-    is_suspect_L |= not_finite(sums)
+    is_suspect_L |= ~np.isfinite(episodes.shifted_square_sum_O).all(axis=1)
     if wanted_L is not None:
         is_suspect_L &= wanted_L
     if pairs:
@@ -237,7 +226,6 @@ def _with_faults(
     lane_M = np.flatnonzero(is_suspect_L)
     if not lane_M.size:
         return episodes
-    episodes = episodes._replace(fault=_no_faults(len(is_suspect_L)))
 
     def put(array_L: np.ndarray, array_M: np.ndarray) -> np.ndarray:
         array_L = array_L.copy()
@@ -247,53 +235,44 @@ def _with_faults(
     return jax.tree.map(put, episodes, again(lane_M))
 
 
-def _no_faults(lanes: int) -> np.ndarray:
-    """`Episodes.fault` [L, 2] of episodes without one."""
-    return np.tile(np.array([0, NO_FAULT], np.int32), (lanes, 1))
-
-
 class _Kernels:
-    """Kernels of a run: one that omits inputs that are always zero, and one with all inputs.
+    """Kernels of a run: one that omits inputs that are always zero, and one with all inputs; each with and without
+    finding faults.
 
     The second is used when the statistics have a mean other than 0 for such an input.
     """
 
     def __init__(
-        self,
-        environment: Environment,
-        spec: WorkerSpec,
-        *,
-        training: bool,
-        per_lane_weights: bool = False,
-        finds_faults: bool = False,
+        self, environment: Environment, spec: WorkerSpec, *, training: bool, per_lane_weights: bool = False
     ) -> None:
         self._environment, self._spec = environment, spec
-        self._compile = partial(
-            compile_episodes, training=training, per_lane_weights=per_lane_weights, finds_faults=finds_faults
-        )
+        self._training, self._per_lane_weights = training, per_lane_weights
         self._zero_O = always_zero(environment)
         if self._zero_O.all():
             self._zero_O[0] = False
-        self._compiled: dict[bool, EpisodeKernel] = {}
+        self._compiled: dict[tuple[bool, bool], EpisodeKernel] = {}
         self._lock = threading.Lock()
         self._packed: tuple[tuple[bool, np.ndarray, np.ndarray], ...] = ()
 
-    def fitting(self, mean: np.ndarray) -> EpisodeKernel:
+    def fitting(self, mean: np.ndarray, *, finds_faults: bool = False) -> EpisodeKernel:
         """The kernel for statistics with this mean, [O] or [L, O]."""
-        return self._kernel(self._omits_zero_inputs(mean))
+        return self._kernel(self._omits_zero_inputs(mean), finds_faults)
 
     def _omits_zero_inputs(self, mean: np.ndarray) -> bool:
         return not mean[..., self._zero_O].any()  # then (0 - mean) / std is 0 and contributes nothing
 
-    def _kernel(self, omit_zero_inputs: bool) -> EpisodeKernel:
+    def _kernel(self, omit_zero_inputs: bool, finds_faults: bool) -> EpisodeKernel:
         with self._lock:  # threads share the kernels
-            if omit_zero_inputs not in self._compiled:
+            if (kind := (omit_zero_inputs, finds_faults)) not in self._compiled:
                 inputs_O = np.flatnonzero(~self._zero_O) if omit_zero_inputs else np.arange(self._zero_O.size)
                 try:
-                    kernel = self._compile(
+                    self._compiled[kind] = compile_episodes(
                         self._environment,
                         self._spec,
                         inputs_O,
+                        training=self._training,
+                        per_lane_weights=self._per_lane_weights,
+                        finds_faults=finds_faults,
                         check=check_episodes,
                         check_resets=partial(check_resets, environment=self._spec.environment),
                     )
@@ -301,13 +280,14 @@ class _Kernels:
                     raise UnsupportedError(
                         f"simd cannot compile {self._spec.environment}: {error}; set compute.rollout to xla"
                     ) from error
-                self._compiled[omit_zero_inputs] = kernel
-        return self._compiled[omit_zero_inputs]
+        return self._compiled[kind]
 
-    def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
+    def for_centre(
+        self, centre_D: np.ndarray, mean_O: np.ndarray, *, finds_faults: bool = False
+    ) -> tuple[EpisodeKernel, np.ndarray]:
         """(kernel, packed weights) of a centre; the packed weights of the last KEPT_PACKED centres are kept."""
         omit_zero_inputs = self._omits_zero_inputs(mean_O)
-        kernel, kept = self._kernel(omit_zero_inputs), self._packed
+        kernel, kept = self._kernel(omit_zero_inputs, finds_faults), self._packed
         for omitted, packed_D, weights in kept:
             if omitted == omit_zero_inputs and np.array_equal(packed_D, centre_D):
                 return kernel, weights
