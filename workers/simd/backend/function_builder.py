@@ -49,7 +49,8 @@ class FunctionBuilder:
         self.lines: list[str] = []
         self.memory: list[str] = []
         """Lines that reserve memory on the stack; they come first in the function."""
-        self.declarations: set[str] = set()
+        self.declarations: dict[str, str] = {}
+        """Declarations of the intrinsics that are called, by name."""
         self._label = "entry"
         self._names = 0
 
@@ -65,7 +66,9 @@ class FunctionBuilder:
 
     def call(self, llvm_type: str, intrinsic: str, *arguments: tuple[str, str]) -> str:
         """Call an intrinsic that returns `llvm_type`, with (type, value) arguments, and declare it."""
-        self.declarations.add(f"declare {llvm_type} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
+        if intrinsic not in self.declarations:
+            types = ", ".join(type_ for type_, _ in arguments)
+            self.declarations[intrinsic] = f"declare {llvm_type} @{intrinsic}({types})"
         return self.value(f"call {llvm_type} @{intrinsic}({', '.join(map(' '.join, arguments))})")
 
     def at(self, pointer: str, index: str | int, llvm_type: str) -> str:
@@ -180,13 +183,14 @@ class FunctionBuilder:
 
         Those that do not fit into registers are on the stack.
         """
-        last = {name: number for number, line in enumerate(self.lines) for name in VALUE.findall(line)}
-        live = most = 0
-        for number, line in enumerate(self.lines):
-            made = line.lstrip().partition(" = ")[0]
-            live += made in last
-            most = max(most, live)
-            live -= sum(last[name] == number for name in set(VALUE.findall(line)))
+        needed: set[str] = set()  # later, or in the line itself
+        most = 0
+        for line in reversed(self.lines):
+            names = VALUE.findall(line)
+            needed.update(names)
+            most = max(most, len(needed))
+            if line.startswith("  %v"):
+                needed.discard(names[0])
         return most
 
     def text(self, calls: str = "noinline") -> str:
@@ -209,7 +213,7 @@ def module(functions: Sequence[FunctionBuilder], *, exact: bool = False) -> str:
     assert inside.name == "inside"
     processor = inside.target.processor
     parameters = ", ".join(parameter.replace(" noalias", "") for parameter in inside.parameters)
-    called = sorted(set().union(*(function.declarations for function in functions)))
+    called = sorted({text for function in functions for text in function.declarations.values()})
     frame = KERNEL.format(
         parameters=parameters,
         arguments=parameters,

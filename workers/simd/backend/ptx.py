@@ -98,7 +98,7 @@ def ptx(functions: Sequence[FunctionBuilder]) -> str:
             kernels.append(
                 KERNEL.format(name=name, parameters=", ".join(function.parameters[:-1]).replace(" noalias", ""))
             )
-    called = sorted(set().union(*(function.declarations for function in functions)))
+    called = sorted({text for function in functions for text in function.declarations.values()})
     text = "\n".join(
         [
             *(function.text("alwaysinline") for function in functions),

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
+
+import numpy as np
 
 from workers.simd.graph.unsupported import UnsupportedError, way_round
 
 
+@functools.cache
 def graph_dtype(dtype: Any) -> str:
     """Dtype of the graph nodes that represent values of a JAX dtype: "f", "i" or "b".
 
@@ -34,8 +38,8 @@ BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshap
 
 def check_bytes(equation: Any) -> None:
     """Raise UnsupportedError if an equation computes with uint8."""
-    dtypes = {str(atom.aval.dtype) for atom in (*equation.invars, *equation.outvars)}
-    if "uint8" in dtypes and equation.primitive.name not in BYTES:
+    atoms = (*equation.invars, *equation.outvars)
+    if equation.primitive.name not in BYTES and any(atom.aval.dtype == np.uint8 for atom in atoms):
         raise UnsupportedError(f"{equation.primitive.name} of uint8")
 
 

@@ -104,8 +104,11 @@ class Tracer:
 
     def map(self, function: Callable[..., int], *arrays: Nodes) -> Nodes:
         """Array of a function's results for each element of the arrays, whose shapes are equal or ()."""
-        shape = np.broadcast_shapes(*(array.shape for array in arrays))
-        flat = [np.broadcast_to(array, shape).reshape(-1).tolist() for array in arrays]
+        shape = arrays[0].shape
+        if any(array.shape != shape for array in arrays):
+            shape = np.broadcast_shapes(*(array.shape for array in arrays))
+            arrays = tuple(np.broadcast_to(array, shape) for array in arrays)
+        flat = [array.reshape(-1).tolist() for array in arrays]
         return np.array([function(*nodes) for nodes in zip(*flat, strict=True)], np.int64).reshape(shape)
 
     def ops(self, name: str, *arrays: Nodes) -> Nodes:

@@ -40,7 +40,7 @@ class FoldingGraph(Graph):
     def build(self, name: str, arguments: tuple[int, ...]) -> int:
         """Node of an operation that does not exist yet, or of a constant or simpler operation with the same value."""
         values = [self.constant(a) for a in arguments]
-        if all(value is not None for value in values):
+        if values[0] is not None and all(value is not None for value in values):
             return self.const(OPERATIONS[name].gives, compute(name, values))
         rule = RULES.get(name)
         folded = rule(self, arguments, values) if rule else None

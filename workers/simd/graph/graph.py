@@ -60,12 +60,18 @@ class Graph:
         self.places: list[Any] = []
         """`place` when each node was added."""
         self._known: dict[Key, int] = {}
+        self._arguments: list[tuple[int, ...]] = []
+        """Argument nodes of each node; empty for nodes that are no operations."""
+        self._constants: dict[int, Any] = {}
+        """Value of each constant node as a NumPy scalar."""
 
     def const(self, dtype: str, value: float | int | bool) -> int:
         """Node of a constant."""
         array = np.asarray(value, NUMPY_DTYPES[dtype])
         bits = int(array.view(np.int32)) if dtype == "f" else int(array)
-        return self._node(("const", dtype, bits), dtype)
+        node = self._node(("const", dtype, bits), dtype)
+        self._constants[node] = array[()]
+        return node
 
     def f(self, value: float) -> int:
         """Node of a float32 constant."""
@@ -81,19 +87,16 @@ class Graph:
 
     def constant(self, node: int) -> Any:
         """Value of a constant node as a NumPy scalar; None for other nodes."""
-        key = self.keys[node]
-        if key[0] != "const":
-            return None
-        array = np.array(key[2], np.int32 if key[1] == "f" else NUMPY_DTYPES[key[1]])
-        return array.view(np.float32)[()] if key[1] == "f" else array[()]
+        return self._constants.get(node)
 
     def arguments(self, node: int) -> tuple[int, ...]:
         """Argument nodes of an operation; empty for nodes that are no operations."""
-        key = self.keys[node]
-        return key[1:] if key[0] in OPERATIONS else ()
+        return self._arguments[node]
 
     def needs(self, node: int) -> tuple[int, ...]:
         """Nodes on which a node depends directly: a result on its carry, a carry on its start and its end."""
+        if arguments := self._arguments[node]:
+            return arguments
         key = self.keys[node]
         match key[0]:
             case "result":
@@ -101,7 +104,7 @@ class Graph:
             case "carry":
                 loop = self.loops[key[2]]
                 return (loop.inits[key[3]], loop.outs[key[3]]) if loop.outs else (loop.inits[key[3]],)
-        return self.arguments(node)
+        return ()
 
     def loop(self, trips: int | None, inits: list[int]) -> Loop:
         """Open a loop whose body is built next from its carries; `close` ends it."""
@@ -148,24 +151,25 @@ class Graph:
         operation = OPERATIONS[name]
         if operation.commutes and arguments[0] > arguments[1]:
             arguments = (arguments[1], arguments[0])
-        known = self._known.get((name, *arguments))
-        if known is not None:
-            return known
-        assert "".join(self.dtypes[a] for a in arguments) == operation.takes, (name, arguments)
-        node = self._known[(name, *arguments)] = self.build(name, arguments)
+        key = (name, *arguments)
+        node = self._known.get(key)
+        if node is None:
+            assert "".join([self.dtypes[a] for a in arguments]) == operation.takes, key
+            node = self._known[key] = self.build(name, arguments)
         return node
 
     def build(self, name: str, arguments: tuple[int, ...]) -> int:
         """Node of an operation that does not exist yet; only `op` calls this."""
-        return self._node((name, *arguments), OPERATIONS[name].gives)
+        return self._node((name, *arguments), OPERATIONS[name].gives, arguments)
 
-    def _node(self, key: Key, dtype: str) -> int:
+    def _node(self, key: Key, dtype: str, arguments: tuple[int, ...] = ()) -> int:
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = len(self.keys)
             self.keys.append(key)
             self.dtypes.append(dtype)
             self.places.append(self.place)
+            self._arguments.append(arguments)
         return known
 
 
@@ -187,17 +191,20 @@ def reached(starts: Iterable[int], needs: Callable[[int], Iterable[int]]) -> set
 
 
 def depending(graph: Graph, loop: Loop) -> set[int]:
-    """Nodes of a loop's body: all nodes that depend on its carries, except its results and their dependents."""
-    body = set(loop.carries)
-    size = 0
-    while len(body) != size:  # the carries of an inner loop have lower numbers than their ends, so repeat
-        size = len(body)
-        for node in range(min(body, default=0), len(graph.keys)):
-            if node not in body and not body.isdisjoint(graph.needs(node)):
-                key = graph.keys[node]
-                if key[0] != "result" or key[2] != loop.number:
-                    body.add(node)
-        # An inner loop is inside with all of its carries or with none.
-        numbers = {graph.keys[node][2] for node in body if graph.keys[node][0] == "carry"}
-        body.update(carry for number in numbers for carry in graph.loops[number].carries)
+    """Nodes of a loop's body: all nodes that depend on its carries, except its results and their dependents.
+
+    An inner loop is inside with all of its carries or with none.
+    """
+    body, results = set(loop.carries), set(loop.results)
+    fresh = loop.carries
+    while fresh:
+        for node in range(min(fresh), len(graph.keys)):
+            if node not in body and not body.isdisjoint(graph.needs(node)) and node not in results:
+                body.add(node)
+        # All but the carries of inner loops have greater numbers than what they depend on, so one pass finds the rest.
+        fresh = []
+        for inner in graph.loops[loop.number + 1 :]:
+            if not body.isdisjoint((*inner.carries, *inner.outs)):
+                fresh += [carry for carry in inner.carries if carry not in body]
+        body.update(fresh)
     return body

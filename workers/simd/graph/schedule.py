@@ -58,22 +58,23 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
     needed = reached(outputs, needs)
     outside = {number: _outside(graph.loops[number], bodies[number] & needed, needed, needs) for number in numbers}
 
+    done = {node for node in alive if graph.keys[node][0] in ("const", "input", "carry")}  # no instruction or loop
+
     def build(number: int | None, targets: Sequence[int]) -> Region:
         """Region of the loop with a number, or of the whole kernel if None, that computes the targets."""
         region = Region(None if number is None else graph.loops[number])
         if region.loop is not None:
             region.carried = [k for k, carry in enumerate(region.loop.carries) if carry in needed]
             targets = [region.loop.outs[k] for k in region.carried]
-        done: set[int] = set()
         waiting = list(reversed(targets))
         while waiting:
             node = waiting[-1]
-            key = graph.keys[node]
-            if node in done or home[node] != number or not _is_made(graph, node):
+            if node in done or home[node] != number:
                 waiting.pop()
                 continue
+            key = graph.keys[node]
             first = outside[key[2]] if key[0] == "result" else needs(node)
-            missing = [need for need in first if need not in done and home[need] == number and _is_made(graph, need)]
+            missing = [need for need in first if need not in done and home[need] == number]
             if missing:
                 waiting += reversed(missing)
                 continue
@@ -89,11 +90,6 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
         return region
 
     return Schedule(build(None, outputs), fused)
-
-
-def _is_made(graph: Graph, node: int) -> bool:
-    """Whether a node is computed by an instruction or a loop."""
-    return graph.keys[node][0] not in ("const", "input", "carry")
 
 
 def _outside(loop: Loop, body: set[int], needed: set[int], needs: Callable[[int], tuple[int, ...]]) -> list[int]:
