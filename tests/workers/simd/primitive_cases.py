@@ -260,6 +260,23 @@ def cholesky(draw: Draw) -> Case:
     return lambda a: lax.linalg.cholesky(jnp.where(known, a, 0.0), symmetrize_input=halves), [matrices]
 
 
+def solves_of_trees(draw: Draw) -> Case:
+    """Systems of a robot, whose links are numbered from the trunk outwards: only a link and what carries it meet."""
+    n, columns = draw(st.integers(1, 7)), draw(st.integers(1, 2))
+    carriers = [draw(st.integers(0, link)) - 1 for link in range(n)]  # -1 carries what no link does
+    meet = np.eye(n, dtype=bool)
+    for link, carrier in enumerate(carriers):
+        meet[link] |= meet[carrier] if carrier >= 0 else False
+    meet |= meet.T
+    diagonals = np.eye(n, dtype=np.float32) * floats(draw, (n, 1), 1.0, 3.0)
+
+    def function(a, b):
+        factor = jax.scipy.linalg.cho_factor(jnp.where(meet, a, 0.0))
+        return jax.scipy.linalg.cho_solve(factor, b), jax.scipy.linalg.cho_solve(factor, 2.0 * b[::-1])
+
+    return function, [floats(draw, (n, n), -0.5, 0.5) / n + diagonals, floats(draw, (n, columns))]
+
+
 def triangular_solve(draw: Draw) -> Case:
     """What must not be read is NaN."""
     batch, n, columns = shape(draw, most=1), draw(st.integers(1, 5)), draw(st.integers(1, 3))
@@ -358,5 +375,6 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "greatest": greatest,
     "cholesky": cholesky,
     "triangular solve": triangular_solve,
+    "solves of trees": solves_of_trees,
     "bits": bits,
 }

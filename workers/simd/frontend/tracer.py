@@ -41,6 +41,8 @@ class Tracer:
 
     def __init__(self, graph: FoldingGraph, rules: Mapping[str, Rule]) -> None:
         self.graph, self.rules = graph, rules
+        self.remembered: dict[Any, Any] = {}
+        """What one rule notes of nodes for another."""
         self.lanes: int | None = None
         """Bool node: the lanes whose values are needed where the tracer is. None if those of all lanes are, as outside
         of branches and loops that depend on data."""
