@@ -123,6 +123,11 @@ def _problem_of_values(part: str, kind: str, arrays: Mapping[str, np.ndarray], s
         of_cvt = [] if centroid_C_B is None else [[len(centroid_C_B)]]
         if of_grid + of_cvt != [list(sizes.cells or ())] or arrays["bounds_B_2"].tolist() != [*map(list, sizes.bounds)]:
             return "has other cells or bounds than the config"
+        if centroid_C_B is not None:
+            low_B, high_B = arrays["bounds_B_2"].T
+            are_inside = ((low_B <= centroid_C_B) & (centroid_C_B <= high_B)).all()
+            if not are_inside or len(np.unique(centroid_C_B, axis=0)) < len(centroid_C_B):
+                return "has centroids outside of the bounds of the map, or twice the same"
     if kind == WEIGHT and not 0.0 <= arrays["value"] <= 1.0:
         return f"has the value {arrays['value']}; must be from 0 to 1"
     return ""

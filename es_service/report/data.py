@@ -20,6 +20,7 @@ from es_service.loop.history import evaluated_nouns
 from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
+from es_service.report.series import X_AXES, Columns
 from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.strangers import sizes_of, sound_meta
@@ -29,8 +30,6 @@ from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
 from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
 
-Columns = Mapping[str, NDArray[np.float64]]
-"""Column name -> its values; NaN stands for no value."""
 TRACE = "trace_T_B"
 POINT = "centre_D"
 MOST_PARAMETERS = 1000
@@ -130,17 +129,23 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
 
 
 def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) -> RunData:
-    """The data of a run that was read before; `driver`: what `lock_holder` said before that."""
+    """The data of a run that was read before; `driver`: what `lock_holder` said before that.
+
+    Raises StoreError if the history lacks what every run writes.
+    """
     problems = list(found.problems)
     run = Run(folder)
     run.__dict__["meta"] = sound_meta(folder, found.meta)  # it is cached there, and `run.db` itself may be damaged
+    history = _floats(found.history)
+    if lacking := [column for column in X_AXES if not np.isfinite(history[column]).all()]:
+        raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
     spec, point_D = task.parameters, None if best is None else best.get(POINT)
     return RunData(
         folder=folder,
         meta=found.meta,
         task=task,
-        history=_floats(found.history),
+        history=history,
         centres=_floats(found.evaluations),
         map=_map(found, problems),
         paths=_paths(found),

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.loop.history import evaluated_word
-from es_service.report.data import Columns
 from es_service.runs.objectives import objectives, weights
 
+Columns = Mapping[str, NDArray[np.float64]]
+"""Column name -> its values; NaN stands for no value."""
 MOST_POINTS = 300
 """A curve of more generations shows groups of neighbouring ones."""
 X_AXES = {"generation": "generation", "env_steps": "environment steps", "wall_clock_s": "seconds"}

@@ -121,7 +121,7 @@ def _record(folder: Path, rng: random.Random) -> str:
             (text,) = connection.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone() or ("[0]",)
             text = _text(text, rng)
             connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, text, text_sha256(key, text)))
-        _rehash(connection)
+        rehash(connection)
     return f"record {key}"
 
 
@@ -136,7 +136,7 @@ def _arrays(folder: Path, rng: random.Random) -> str:
         payload, what = _payload(payload, rng)
         row = payload, part_sha256(part, at, payload), part, at
         connection.execute("UPDATE state SET payload = ?, sha256 = ? WHERE part = ? AND generation = ?", row)
-        _rehash(connection)
+        rehash(connection)
     return f"{what} in {part} of {at}"
 
 
@@ -200,7 +200,7 @@ def _names(folder: Path, rng: random.Random) -> str:
         for _, at, payload in rows if new is not None else ():
             row = new, at, part_sha256(new, at, payload), payload
             connection.execute("INSERT OR REPLACE INTO state VALUES (?, ?, ?, ?)", row)
-        _rehash(connection)
+        rehash(connection)
     return f"{part} is now {new}"
 
 
@@ -219,7 +219,7 @@ def _history(folder: Path, rng: random.Random) -> str:
                 )
             else:
                 connection.execute(f"UPDATE history SET {quoted(name)} = ?{where}", (value,))
-        _rehash(connection)
+        rehash(connection)
     return f"{name} is {value!r}{where}"
 
 
@@ -240,7 +240,7 @@ def _evaluated(folder: Path, rng: random.Random) -> str:
         else:
             values = [b"R" + value[1:] if value[:1] == b"I" else value for value in values]
         connection.execute("UPDATE history SET evaluations = ? WHERE generation = ?", (b"".join(values), at))
-        _rehash(connection)
+        rehash(connection)
     return f"evaluated centres of {at}: {kind}"
 
 
@@ -314,7 +314,7 @@ def _yaml(folder: Path, rng: random.Random) -> str:
     return "config.yaml"
 
 
-def _rehash(connection: sqlite3.Connection) -> None:
+def rehash(connection: sqlite3.Connection) -> None:
     """Give every row of the history the SHA-256s of what it has now, as far as a row can have one."""
     states: dict[int, dict[str, tuple[int, str]]] = {}
     for part, at, sha256, size in connection.execute("SELECT part, generation, sha256, length(payload) FROM state"):

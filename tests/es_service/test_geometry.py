@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.cluster.vq import kmeans2
 
 from es_service import api
+from es_service.loop.forms import Sizes, problem
 from es_service.loop.parts import geometry_from_arrays, geometry_to_arrays
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.maps import geometry as geometries
@@ -186,6 +187,13 @@ def test_geometries_come_back_as_they_were():
     assert isinstance(again, Cvt)
     assert again.bounds == cvt.bounds == SQUARE
     np.testing.assert_array_equal(again.centroid_C_B, cvt.centroid_C_B)
+
+
+@pytest.mark.parametrize(("centroid", "is_right"), [((0.1, -0.9), True), ((0.5, 0.5), False), ((1e300, 0.0), False)])
+def test_stored_centroids_are_different_places_in_the_map(centroid, is_right):
+    arrays = geometry_to_arrays(Cvt(SQUARE, np.array([[0.5, 0.5], centroid])))
+    found = problem("map", arrays, Sizes(9, 2, 2, (2,), SQUARE))
+    assert found == ("" if is_right else "map has centroids outside of the bounds of the map, or twice the same")
 
 
 def test_cells_of_a_cvt_are_even_in_oblong_bounds_too():

@@ -15,6 +15,7 @@ from es_service.runs.view import open_run
 from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
 from tests.database import database
+from tests.es_service.forgeries import rehash
 from tests.run_examples import write_run
 from workers.environments import SHIPPED
 
@@ -105,6 +106,18 @@ def test_generation_0_alone_is_shown(tmp_path):
     assert "Only the initial centres were evaluated" in facts.verdict(data)
     assert "before any update" in facts.verdict(data)
     assert series.charts(data.history, data.centres, 0.0)[0].title == "Fitness"
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("wall_clock_s", "NULL"), ("wall_clock_s", "1e999"), ("env_steps", "NULL")]
+)
+def test_a_forged_run_without_a_place_on_an_axis_is_refused(tmp_path, column, value):
+    folder = write_run(tmp_path / "forged", generations=2, filled=0.01)
+    with database(folder / "run.db") as connection:
+        connection.execute(f"UPDATE history SET {column} = {value} WHERE generation = 1")
+        rehash(connection)
+    with pytest.raises(StoreError, match=f"is not what es-service writes: a generation has no {column}"):
+        read_run(folder, digest=False)
 
 
 def test_curves_of_long_runs_are_groups_of_generations():
