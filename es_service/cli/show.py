@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
+from es_service.cli.commands import command
 from es_service.cli.console import console
 from es_service.cli.data import catalogue_data, digest_data, print_json, status_data
 from es_service.cli.options import JsonOption, print_note
@@ -22,6 +23,9 @@ from es_service.protocol.system import given_path
 from es_service.runs.folders import runs_of
 from es_service.runs.run_status import newest_runs, read_status
 from es_service.store import digest
+
+NEWEST = 10
+"""Most runs that `status` shows without a folder."""
 
 
 def status(
@@ -43,10 +47,14 @@ def status(
     if follow and as_json:
         raise ConfigError("--follow and --json cannot be combined; omit one of them")
     if not folders:
-        folders = newest_runs(api.RUNS_FOLDER)
+        found = newest_runs(api.RUNS_FOLDER)
+        folders = found[:NEWEST]
         if not folders and not as_json:
             print_note(f"there is no run under {api.RUNS_FOLDER}/ in this folder; give the folder of a run")
             return
+        if len(found) > NEWEST and not as_json:
+            everything = command("status", f"{api.RUNS_FOLDER}/")
+            print_note(f"the {NEWEST} newest of {len(found)} runs under {api.RUNS_FOLDER}/; all: {everything}")
     elif is_single(folders) and not as_json:
         run = api.open_run(folders[0])
         (follow_status if follow else print_status)(console, run)

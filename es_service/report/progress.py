@@ -92,12 +92,17 @@ def print_notice(console: Console, notice: str) -> None:
     console.print(f"note: {notice}", soft_wrap=True)
 
 
+def _spread(std: float) -> str:
+    """The spread of a mean; empty for 0, that of a single episode or of equal ones."""
+    return f" ± {std:.2f}" if std else ""
+
+
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
     """Table of the last generations, and their time by part; fewer columns and rows on a small screen."""
     evaluated = f"{evaluated_word(recent[-1])} fitness"
     columns: dict[str, Callable[[Row], str]] = {
         "generation": lambda row: str(row["generation"]),
-        evaluated: lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
+        evaluated: lambda row: f"{row['centre_fitness_mean']:.2f}" + _spread(row["centre_fitness_std"]),
         "best so far": lambda row: f"{row['best_fitness']:.2f}",
         "env steps": lambda row: short(row["env_steps"]),
         "steps/s": lambda row: short(row["steps_per_second"]),

@@ -67,10 +67,10 @@ def population_size(constants: Mapping[str, Any]) -> str:
 
 
 def newest_runs(folder: Path) -> list[Path]:
-    """The ten runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
+    """The runs directly below a folder, that written last first; empty if the folder does not exist."""
     databases = {run: run / DATABASE for run in runs_inside(folder)}
     written = {run: file.stat().st_mtime for run, file in databases.items() if file.exists()}
-    return sorted(written, key=lambda run: written[run], reverse=True)[:10]
+    return sorted(written, key=lambda run: written[run], reverse=True)
 
 
 def read_status(run: Run) -> RunStatus:

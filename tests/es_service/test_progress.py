@@ -67,3 +67,12 @@ def test_a_generation_that_moves_no_centre_shows_its_fittest_policy(changes, wor
     with console.capture() as capture:
         console.print(live_table("runs/a", deque([row]), 80, 24))
     assert f"{word} fitness" in capture.get()
+
+
+@pytest.mark.parametrize(("std", "shown"), [(0.5, "-1234.56 ± 0.50 "), (0.0, "-1234.56 ")])
+def test_the_spread_of_one_episode_is_not_shown(std, shown):
+    console = Console(width=80, force_terminal=False)
+    with console.capture() as capture:
+        console.print(live_table("runs/a", deque([ROW | {"centre_fitness_std": std}]), 80, 24))
+    assert shown in capture.get()
+    assert ("±" in capture.get()) == bool(std)

@@ -215,6 +215,11 @@ def test_without_a_folder_the_newest_runs_are_shown(run, tmp_path, monkeypatch):
         os.utime(tmp_path / "runs" / name / "run.db", (1e9 - age, 1e9 - age))
     shown = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"}).stdout.splitlines()
     assert [line.split()[0] for line in shown] == ["run", "runs/new", "runs/old"]
+    monkeypatch.setattr("es_service.cli.show.NEWEST", 1)
+    found = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"})
+    assert [line.split()[0] for line in found.stdout.splitlines()] == ["run", "runs/new"]
+    assert "the 1 newest of 2 runs under runs/; all: es-service status runs/" in found.stderr
+    assert len(json.loads(CliRunner().invoke(app, ["status", "--json"]).stdout)) == 1
     refused = CliRunner().invoke(app, ["status", "--follow"])
     assert "--follow: needs exactly one folder, got 0" in str(refused.exception)
 

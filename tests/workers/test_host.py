@@ -445,11 +445,11 @@ STEP = (
             lambda self, seed: np.full(99, "x"),
             rf"reset returned the observation array\(.{{80,90}} \.\.\.; {RESET}",
         ),
-        ("descriptor", lambda self: None, r"the descriptor is None \(is a `return` missing\?\); it must be 1 numbers"),
+        ("descriptor", lambda self: None, r"the descriptor is None \(is a `return` missing\?\); it must be 1 number$"),
         (
             "goal_distance",
             lambda self: None,
-            r"goal_distance is None \(is a `return` missing\?\); it must be 1 numbers",
+            r"goal_distance is None \(is a `return` missing\?\); it must be 1 number$",
         ),
         ("goal_distance", lambda self: [0.0, 1.0], "goal_distance has 2 numbers, not 1"),
         ("success", lambda self: None, r"success is None \(is a `return` missing\?\); it must be one bool"),

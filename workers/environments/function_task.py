@@ -77,7 +77,7 @@ class FunctionTask:
             raise TaskError(f"{self.name} returned the descriptor {result[1]!r}; it must be numbers") from None
         if descriptor_B.size != self.descriptor_size:
             raise TaskError(
-                f"{self.name} returned a descriptor of {descriptor_B.size} numbers, not {self.descriptor_size}"
+                f"{self.name} returned a descriptor of size {descriptor_B.size}, not {self.descriptor_size}"
             )
         return _number(result[0], self.name), descriptor_B
 

@@ -76,12 +76,12 @@ class HostTask:
 
 
 CONTRACTS = {
-    "reset": "reset(seed) must start an episode that depends only on the seed, and return an observation of {} "
-    "numbers, or (observation, info)",
+    "reset": "reset(seed) must start an episode that depends only on the seed, and return an observation of {}, "
+    "or (observation, info)",
     "step": "step(action) must do one step, and return (observation, reward, done), or (observation, reward, "
     "terminated, truncated, info)",
 }
-"""Method -> what it must take and return, in words; {} is the size of an observation."""
+"""Method -> what it must take and return, in words; {} is for the size of an observation."""
 
 
 class HostEnvironment:
@@ -178,13 +178,13 @@ class HostEnvironment:
             raise self._broken(method, f"takes {signature} and not {takes}") from None
 
     def _broken(self, method: str, what: str) -> TaskError:
-        contract = CONTRACTS[method].format(self._task.observation_size)
+        contract = CONTRACTS[method].format(_counted(self._task.observation_size))
         return TaskError(f"{self._task.name}: {method} {what}; {contract}")
 
     def _numbers(self, what: str, value: Any, size: int) -> FloatArray:
         """A value as an array [N]; a copy, since an object may change the array that it has returned."""
         if (array_N := _array(value)) is None:
-            raise TaskError(f"{self._task.name}: {what} is {_shown(value)}; it must be {size} numbers")
+            raise TaskError(f"{self._task.name}: {what} is {_shown(value)}; it must be {_counted(size)}")
         return self._of_size(what, array_N, size)
 
     def _observed(self, method: str, observation: Any) -> FloatArray:
@@ -195,7 +195,7 @@ class HostEnvironment:
 
     def _of_size(self, what: str, array_N: FloatArray, size: int) -> FloatArray:
         if array_N.size != size:
-            raise TaskError(f"{self._task.name}: {what} has {array_N.size} numbers, not {size}")
+            raise TaskError(f"{self._task.name}: {what} has {_counted(array_N.size)}, not {size}")
         return array_N
 
 
@@ -265,6 +265,10 @@ def chosen(action_L_A: FloatArray) -> list[int]:
 def unchanged(action_L_A: FloatArray) -> FloatArray:
     """Actions of a policy as they are, in arrays that the object may change."""
     return action_L_A.copy()
+
+
+def _counted(size: int) -> str:
+    return "1 number" if size == 1 else f"{size} numbers"
 
 
 def _array(value: Any) -> FloatArray | None:
