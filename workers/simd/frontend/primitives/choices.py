@@ -94,17 +94,12 @@ def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes
     return t.map(lambda lo, n, hi: lesser(greater(n, lo), hi), low, x, high)
 
 
-def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
-    """Node that chooses between two nodes of the same dtype by a bool node."""
-    return g.choose(mask, if_true, if_false)
-
-
 def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]) -> list[Nodes]:
     """Arrays of the case that `which` names, element by element; numbers out of range name the first or last case."""
     g, is_bool, chosen = t.graph, graph_dtype(dtype) == "b", list(cases[-1])
 
     def choice(mask: int, early: int, late: int) -> int:
-        return choose(g, mask, late, early) if is_bool else choose(g, mask, early, late)
+        return g.choose(mask, late, early) if is_bool else g.choose(mask, early, late)
 
     for number, case in reversed(list(enumerate(cases[:-1]))):
         mask = which if is_bool else t.map(lambda n, end=number + 1: g.op("slt", n, g.i(end)), which)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from workers.simd.frontend.dtypes import dtype_in, graph_dtype
-from workers.simd.frontend.primitives.choices import choose, extreme_of, to_float
+from workers.simd.frontend.primitives.choices import extreme_of, to_float
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
 from workers.simd.graph.graph import Graph
@@ -91,7 +91,7 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         best, at = row[0], g.i(0)
         for number, node in enumerate(row[1:], 1):
             ahead = goes_ahead(node, best)
-            best = choose(g, ahead, node, best)
+            best = g.choose(ahead, node, best)
             at = g.op("iselect", ahead, g.i(number), at)
         indices.append(at)
     return np.array(indices, np.int64).reshape(rows.shape[:-1])
