@@ -16,7 +16,7 @@ from jax import lax
 
 from tests.workers.simd.rollouts import every_target
 from workers.environments import make_environment
-from workers.simd.backend import machine_code, target
+from workers.simd.backend import emit, machine_code, target
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import aligned, pack
 from workers.simd.episodes.kernel import Kernel, compile_kernel
@@ -112,6 +112,25 @@ def halved(x):
 
 def swing(x):
     return lax.fori_loop(0, 500, lambda _, x: x - 0.01 * jnp.sin(x[::-1]), x)
+
+
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+def test_long_code_in_parts_has_the_same_bits(target: Target, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With loops among its parts, one of which reads what was computed before it."""
+
+    def function(x):
+        y = jnp.sin(x) * x[::-1] + jnp.cumsum(x)
+        z = lax.fori_loop(0, 400, lambda _, z: jnp.where(z > 3, z * 0.5 + y, z - y * y), y)
+        return jnp.cumsum(z * y) - jnp.exp(-(z * z))
+
+    x = np.random.default_rng(0).normal(0, 1, (LANES, 12)).astype(np.float32)
+    whole = compile_kernel(function, one_of(x), target=target, folder=tmp_path / "whole")
+    monkeypatch.setattr(emit, "MOST_UNPARTED", 20)
+    monkeypatch.setattr(emit, "PART", 7)
+    graph, inputs, outputs = trace_jaxpr(jax.make_jaxpr(function)(one_of(x)))
+    assert emit.emit(graph, outputs, inputs, target).count("_never:") > 20
+    parts = compile_kernel(function, one_of(x), target=target, folder=tmp_path / "parts")
+    assert parts(x).tobytes() == whole(x).tobytes()
 
 
 @pytest.mark.parametrize("function", [swing, halved])

@@ -162,6 +162,20 @@ class FunctionBuilder:
             for (llvm_type, first), out in zip(carries, outs, strict=True)
         ]
 
+    def part(self) -> None:
+        """Begin another basic block of straight code.
+
+        LLVM joins blocks that always follow each other. So the one before ends with a branch that is never taken: to
+        where the first parameter, a pointer, is null.
+        """
+        self._names += 1
+        label = f"part{self._names}"
+        never = self.value(f"icmp eq ptr {self.parameters[0].split()[-1]}, null")
+        self.do(f"br i1 {never}, label %{label}_never, label %{label}")
+        self.label(f"{label}_never")
+        self.do("ret void")
+        self.label(label)
+
     def any(self, words: str, lanes: int | None = None) -> str:
         """An i1 that is true if any word of an integer vector is not 0."""
         llvm_type = f"<{lanes or self.width} x i32>"
