@@ -1,11 +1,15 @@
 """How fast is compiled physics on one core, beside xla and beside what the core can do?
 
     python -m tests.benchmarks.simd_physics                # half an hour with --tasks all, five minutes without
+    python -m tests.benchmarks.simd_physics --sizes brax:ant "brax:ant 4 x 8"       # what compiling takes, by stage
 
 For each task: control steps a second without policies by xla, at the batch it likes best, and by simd, one after the
 other, three rounds, the median of each; scalar operations before and after folding; what compiling takes, cold and from
 the cache, in processes of their own; GFLOP/s (a fused operation is two) beside the peak of this core: as many fused
 operations as it does when nothing else is asked of it.
+
+With --sizes, for tasks and rows of `tests.benchmarks.mujoco`: processor time of JAX's trace, of ours, of writing LLVM's
+IR and of LLVM; the code's bytes and instructions, and how many of those read or write the stack.
 """
 
 from __future__ import annotations
@@ -14,11 +18,14 @@ import argparse
 import ctypes
 import json
 import os
+import re
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -44,16 +51,12 @@ def rate(task: str, rollout: str, batch: int, cache: str) -> int:
     return child(["-m", "workers.measure", json.dumps(arguments | {"rollout": rollout})], cache)["steps_per_second"]
 
 
-def facts_of(task: str) -> dict:
-    """One control step compiled, with everything it gives; run in a process of its own."""
+def step_of(task: str) -> tuple[Any, Any, Any]:
+    """(one control step with everything it gives, shapes of its state, shape of its action)."""
     import jax
     import jax.numpy as jnp
 
     from workers.environments import SHIPPED, describe_environment, make_environment
-    from workers.simd.episodes.kernel import compile_kernel
-    from workers.simd.frontend.trace import trace_jaxpr
-    from workers.simd.graph.graph import Graph
-    from workers.simd.graph.schedule import Region, schedule
 
     environment = make_environment(task, {})
     size = SHIPPED[task] if task in SHIPPED else describe_environment(task)
@@ -63,7 +66,72 @@ def facts_of(task: str) -> dict:
         return after, reward, done, environment.observe(after), environment.descriptor(after)
 
     state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
-    action = jax.ShapeDtypeStruct((size.action_size,), jnp.float32)
+    return step, state, jax.ShapeDtypeStruct((size.action_size,), jnp.float32)
+
+
+def step_of_row(row: str, playground: Path | None) -> tuple[Any, Any, Any]:
+    """As `step_of`, of a row of `tests.benchmarks.mujoco`."""
+    from tests.benchmarks.mujoco import rows
+    from workers.environments import mujoco_parts
+
+    example = rows()[row](playground)
+    model = mujoco_parts.put_model(example.model)
+
+    def step(state: Any, ctrl: Any) -> Any:
+        return mujoco_parts.step(model, state, ctrl, example.substeps)
+
+    return step, mujoco_parts.start(model), np.zeros(example.model.nu, np.float32)
+
+
+def sizes_of(name: str, playground: Path | None) -> dict:
+    """What compiling one control step takes by stage, and the machine code of this processor."""
+    import jax
+
+    from tests.benchmarks.mujoco import rows
+    from workers.simd.backend.emit import emit
+    from workers.simd.backend.machine_code import compile_object
+    from workers.simd.backend.target import host_target
+    from workers.simd.frontend.trace import trace_jaxpr
+
+    step, state, action = step_of_row(name, playground) if name in rows() else step_of(name)
+    clock = [time.process_time()]
+
+    def lap(result: Any) -> Any:
+        clock.append(time.process_time())
+        return result
+
+    closed = lap(jax.make_jaxpr(step)(state, action))
+    graph, inputs, outputs = lap(trace_jaxpr(closed))
+    text = lap(emit(graph, outputs, inputs, host_target()))
+    code = lap(compile_object(text, host_target()))
+    with tempfile.NamedTemporaryFile(suffix=".o") as file:
+        file.write(code)
+        file.flush()
+        listing = subprocess.run(
+            ["objdump", "-d", "--no-show-raw-insn", file.name], capture_output=True, text=True, check=True
+        ).stdout
+    instructions = [line for line in listing.splitlines() if re.match(r" *[0-9a-f]+:\t", line)]
+    stages = zip(("jax_s", "trace_s", "write_s", "llvm_s"), np.diff(clock), strict=True)
+    return {
+        "name": name,
+        "target": host_target().describe(),
+        **{stage: round(float(seconds), 2) for stage, seconds in stages},
+        "code_kb": round(len(code) / 1000),
+        "instructions": len(instructions),
+        "of_the_stack": sum(bool(re.search(r"\(%r[sb]p|\[sp", line)) for line in instructions),
+    }
+
+
+def facts_of(task: str) -> dict:
+    """One control step compiled, with everything it gives; run in a process of its own."""
+    import jax
+
+    from workers.simd.episodes.kernel import compile_kernel
+    from workers.simd.frontend.trace import trace_jaxpr
+    from workers.simd.graph.graph import Graph
+    from workers.simd.graph.schedule import Region, schedule
+
+    step, state, action = step_of(task)
     started = time.perf_counter()
     facts = compile_kernel(step, state, action).facts
     seconds = time.perf_counter() - started
@@ -91,7 +159,7 @@ def facts_of(task: str) -> dict:
         for region_step in region.steps:
             if isinstance(region_step, Region):
                 assert region_step.loop is not None
-                count(region_step, times * region_step.loop.trips)
+                count(region_step, times * (region_step.loop.trips or 1))  # one trip if data ends the loop
             else:
                 counts["operations"] += times
                 name = graph.keys[region_step][0]
@@ -160,7 +228,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), help="names, or all")
     parser.add_argument("--facts", metavar="TASK", help="only what compiling it took, as JSON")
+    parser.add_argument("--sizes", nargs="+", metavar="NAME", help="only what compiling these takes, by stage")
+    parser.add_argument("--playground", type=Path, help="folder that contains mujoco_playground, for its rows")
     arguments = parser.parse_args()
+    for name in arguments.sizes or ():
+        print(json.dumps(sizes_of(name, arguments.playground)), flush=True)
+    if arguments.sizes:
+        return
     if arguments.facts:
         print(json.dumps(facts_of(arguments.facts)))
         return
