@@ -11,7 +11,7 @@ import pytest
 
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
-from es_service.protocol.messages import PolicySpec, with_options
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
@@ -25,6 +25,7 @@ from workers.environments import (
     make_environment,
     user_task,
 )
+from workers.simd.episodes import rollout
 from workers.simd.episodes.kernel import compile_kernel
 
 pytestmark = [
@@ -234,3 +235,20 @@ def test_versions_that_do_not_work_are_named(monkeypatch):
     monkeypatch.delitem(brax_parts.WORKS_WITH, "mujoco")
     with pytest.raises(TaskError, match=r"no-such-package is not installed"):
         brax_parts.check_versions()
+
+
+def test_an_ant_of_mjx_runs_with_simd():
+    """The check of a run with `compute.rollout: auto`."""
+    options = {"backend": "mjx"}
+    assert rollout.why_not(describe_environment("brax:ant", {"options": options}), options) == ""
+
+
+@pytest.mark.long
+def test_episodes_of_an_ant_of_mjx_are_those_of_xla():
+    options = {"descriptor": "final_xy", "backend": "mjx"}
+    shape = PolicySpec((27, 8))
+    given = {"environment": "brax:ant", "environment_options": options, "policy": shape, "episode_steps": 10}
+    point = centre(random_parameters(size=shape.parameters), observation_size=27)
+    ours, theirs = (chunk_runner(spec(rollout=name, **given))(point, EvaluationChunk(1, 0)) for name in ("simd", "xla"))
+    np.testing.assert_allclose(ours.returns, theirs.returns, rtol=1e-3)
+    np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=1e-4)

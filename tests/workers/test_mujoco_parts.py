@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests import mujoco_models
 from workers.environments import TaskError, mujoco_parts
 from workers.environments.mujoco_parts import MjModel, mujoco
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.graph.unsupported import UnsupportedError
 
 BALLS = """<mujoco>
   <option gravity="0 0 -10" {option}/>
@@ -101,3 +105,43 @@ def test_what_mjx_lacks_is_refused_by_its_name(parts: dict[str, str], named: str
     with pytest.raises(TaskError, match=r"^MJX lacks parts of this MuJoCo model: ") as refused:
         mujoco_parts.put_model(model_of(**parts))
     assert named in str(refused.value)
+
+
+@pytest.mark.slow
+def test_what_simd_lacks_is_refused_with_the_line_of_the_user(monkeypatch: pytest.MonkeyPatch):
+    """The primitive itself stands in a line of MJX, in which no user can do anything."""
+    mx = mujoco_parts.put_model(model_of())
+    monkeypatch.delitem(PRIMITIVES, "cholesky")
+    with pytest.raises(UnsupportedError, match=r"^the primitive cholesky \(at .*/test_mujoco_parts\.py:[0-9]+ \("):
+        compile_kernel(lambda state: mujoco_parts.step(mx, state, np.zeros(0)), mujoco_parts.start(mx))
+
+
+POLE = """<body name="pole" pos="-1 0 0.5">
+  <joint name="hinge" axis="0 1 0" damping="0.5" limited="true" range="-60 60"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.05"/></body>"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("option", "within"),
+    [
+        ('integrator="Euler"', 1e-4),
+        ('integrator="implicitfast" cone="elliptic"', 1e-4),
+        ('integrator="RK4"', 1e-4),
+        ('solver="CG"', 3e-3),  # in float32 it stops earlier
+        ('solver="CG" cone="elliptic"', 3e-3),
+    ],
+)
+def test_integrators_cones_and_solvers_are_those_of_c_mujoco(option: str, within: float):
+    """Two balls and a damped pole that is pushed beyond its limit; Euler integrates its damping implicitly."""
+    motor = '<actuator><motor joint="hinge" gear="2"/></actuator>'
+    model = mujoco_models.as_c(model_of(option=option, more=POLE, after=motor))
+    mx = mujoco_parts.put_model(model)
+    states = mujoco_models.c_states(model, 5, 64)
+    ctrl = mujoco_models.random_ctrl(model, 64, np.random.default_rng(1))
+    start = mujoco_parts.start(mx)
+    kernel = compile_kernel(lambda state, ctrl: mujoco_parts.step(mx, state, ctrl, 5), start, np.zeros(1, np.float32))
+    ours, theirs = kernel(states, ctrl), mujoco_models.c_step(model, 5, states, ctrl)
+    assert (theirs.contacts > 0).mean() > 0.5
+    for of, to in ((ours.qpos, theirs.qpos), (ours.qvel, theirs.qvel)):
+        assert np.quantile(mujoco_models.relative_error(of, to), 0.95) < within

@@ -293,6 +293,7 @@ def triangular_solve(draw: Draw) -> Case:
 CASES: dict[str, Callable[[Draw], Case]] = {
     "add": binary(jnp.add),
     "integer arithmetic": binary(lambda a, b: (a + b, a - b, a * b, -a, jnp.abs(a), lax.square(a)), integers),
+    "terms of a gradient": unary(jax.grad(lambda x: (jnp.sin(x) * x).sum())),
     "sub": binary(jnp.subtract),
     "mul": binary(jnp.multiply),
     "div": binary(jnp.divide),

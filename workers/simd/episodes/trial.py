@@ -16,13 +16,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import source_info_util
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import KEY_WORDS, Domain, stream_keys
 from es_service.protocol.options import OptionValue, option_values
-from es_service.protocol.raised import is_users_file
 from es_service.protocol.sources import user_path
 from workers.environments import Environment, make_environment
 from workers.rollouts.backend import Examination
@@ -33,7 +31,7 @@ from workers.simd.episodes.check import as_words
 from workers.simd.episodes.rollout import training_program, why_not
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.frontend.tracer import Place
+from workers.simd.frontend.tracer import line_of
 from workers.simd.graph.graph import Graph, reached
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.reference import evaluate
@@ -282,9 +280,9 @@ def _explained(traced: _Traced, words: np.ndarray, found: Found, step: int, *, i
     if is_hidden:
         products = sorted(behind(starts, differing) & traced.products & differing)
         first = next((node for node in products if not {*graph.arguments(node)} & differing), products[0])
-        starts, product = list(graph.arguments(first)), _line(graph.places[first])
+        starts, product = list(graph.arguments(first)), line_of(graph.places[first])
     origins = sorted(behind(starts, not_finite) & begun)
-    origin = _line(graph.places[origins[0]]) if origins else ""
+    origin = line_of(graph.places[origins[0]]) if origins else ""
     is_what = "depends on NaN"
     if graph.dtypes[traced.outputs[output]] == "f":
         number = _computed(traced, words)[output, lane : lane + 1].view(np.float32)
@@ -299,16 +297,3 @@ def _lines(origin: str, product: str) -> str:
         return f": {product} multiplies by 0 what is not finite"
     lines = f": what {origin} computes is not finite" if origin else ""
     return f"{lines}, and {product} multiplies it by 0" if product else lines
-
-
-def _line(place: Place | None) -> str:
-    """The innermost line of the user's files, as "file:line (function)"; without one, that of a library."""
-    sources = []
-    while place is not None:
-        sources.append(place.source)
-        place = place.outer
-    for source in sources:
-        for frame in source.traceback.frames if source.traceback is not None else ():
-            if is_users_file(frame.file_name):
-                return f"{frame.file_name}:{frame.line_num} ({frame.function_name})"
-    return next(filter(None, map(source_info_util.summarize, sources)), "")

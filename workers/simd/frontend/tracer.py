@@ -15,6 +15,7 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
+from es_service.protocol.raised import is_users_file
 from workers.simd.frontend.dtypes import check_bytes, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop, build_while
@@ -34,6 +35,19 @@ class Place(NamedTuple):
     source: source_info_util.SourceInfo
     outer: Place | None
     """The equation whose function contains it."""
+
+
+def line_of(place: Place | None) -> str:
+    """The innermost line of the user's files, as "file:line (function)"; without one, that of a library."""
+    sources = []
+    while place is not None:
+        sources.append(place.source)
+        place = place.outer
+    for source in sources:
+        for frame in source.traceback.frames if source.traceback is not None else ():
+            if is_users_file(frame.file_name):
+                return f"{frame.file_name}:{frame.line_num} ({frame.function_name})"
+    return next(filter(None, map(source_info_util.summarize, sources)), "")
 
 
 class Tracer:
@@ -74,8 +88,7 @@ class Tracer:
                 if len(self.graph.keys) > GRAPH_LIMIT:
                     raise UnsupportedError(f"more than {GRAPH_LIMIT:,} operations")
             except UnsupportedError as error:
-                # An equation inside of a library's function may have no source line; the calling equation has one.
-                where = source_info_util.summarize(equation.source_info)
+                where = line_of(self.graph.place)
                 if where and not error.place:
                     raise UnsupportedError(error.message, place=where, advice=error.advice) from None
                 raise

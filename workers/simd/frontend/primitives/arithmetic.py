@@ -28,7 +28,7 @@ def _by_dtype(floats: str | None, integers: str | None, booleans: str | None = N
     return rule
 
 
-PRIMITIVES["add"] = _by_dtype("add", "iadd")
+PRIMITIVES["add"] = PRIMITIVES["add_any"] = _by_dtype("add", "iadd")  # add_any adds the terms of a gradient
 PRIMITIVES["sub"] = _by_dtype("sub", "isub")
 PRIMITIVES["mul"] = _by_dtype("mul", "imul")
 PRIMITIVES["sqrt"] = _by_dtype("sqrt", None)
