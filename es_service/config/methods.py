@@ -118,8 +118,9 @@ def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: A
     Args:
         default: the value that the key has if it is left out, for one that every config has.
     """
-    others = one_of(methods_with(key, algorithms), "and")
-    what = f"{show(value)} has no effect with {method}; leave it out (a key of {others})"
+    others = methods_with(key, algorithms)
+    whose = f" (a key of {one_of(others, 'and')})" if others else ""
+    what = f"{show(value)} has no effect with {method}; leave it out{whose}"
     return problem_of(key, value, what, suggestion=default)
 
 

@@ -128,6 +128,11 @@ def _problem_of_values(part: str, kind: str, arrays: Mapping[str, np.ndarray], s
             are_inside = ((low_B <= centroid_C_B) & (centroid_C_B <= high_B)).all()
             if not are_inside or len(np.unique(centroid_C_B, axis=0)) < len(centroid_C_B):
                 return "has centroids outside of the bounds of the map, or twice the same"
+    if kind == CENTRE_PREFIX:
+        counts = {name: arrays[name] for name, kinds in sizes.step.items() if kinds == INTEGER}
+        for name, array in counts.items():
+            if not ((array >= 0) & (array < 2**53)).all():
+                return f"has an array {name!r} that counts {array}"
     if kind == WEIGHT and not 0.0 <= arrays["value"] <= 1.0:
         return f"has the value {arrays['value']}; must be from 0 to 1"
     return ""

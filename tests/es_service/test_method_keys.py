@@ -13,7 +13,7 @@ import pytest
 from es_service import api
 from es_service.cli.options import print_config_notes
 from es_service.config.loading import kept, left_out
-from es_service.config.methods import all_search_fields, has_effect, methods_with
+from es_service.config.methods import all_search_fields, has_effect, methods_with, no_effect
 from es_service.config.model import flat
 from es_service.config.shipped import shipped_configs
 from es_service.config.tasks import TASKS
@@ -280,6 +280,11 @@ def test_a_sweep_over_methods_says_of_each_key_only_one_thing(tmp_path):
         plan(MINIMAL, tmp_path, {"search.algorithm": ["es", "map_elites", "nope", "no.such:search"]}, None, normalised)
     found = [problem.field for problem in caught.value.problems]
     assert found == ["policy.observation_normalization", "search.algorithm", "search.algorithm"]
+
+
+def test_a_key_that_no_method_has_is_refused_without_naming_one():
+    problem = no_effect("search.of_nobody", 3, "es", ALGORITHMS)
+    assert problem.sentence == "search.of_nobody: 3 has no effect with es; leave it out"
 
 
 def test_a_run_may_be_told_again_what_has_no_effect_but_nothing_else(tmp_path):

@@ -104,6 +104,7 @@ def test_a_stored_centre_has_the_arrays_of_its_step(tmp_path, kind):
     require_forms(tmp_path, run, {"centre_0": arrays | {"of_user_D": arrays["centre_D"]}})
     for name, values in STEPS[kind].fresh(size).items():
         without = {other: array for other, array in arrays.items() if other != name}
-        for wrong, what in ((without, "lacks"), (arrays | {name: values.astype(str)}, "has")):
+        forged = [values.astype(str)] + ([np.int64(-1), np.int64(2**62)] if values.dtype.kind == "i" else [])
+        for wrong, what in [(without, "lacks"), *((arrays | {name: np.asarray(value)}, "has") for value in forged)]:
             with pytest.raises(StoreError, match=f"centre_0 {what} .*array .?{name}"):
                 require_forms(tmp_path, run, {"centre_0": wrong})

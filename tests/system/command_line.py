@@ -12,6 +12,8 @@ from tests.system import warm
 from tests.system.processes import ROOT
 
 PROGRAM = Path(sys.executable).with_name("es-service")
+COMPILES = ("note: compiling ", "note: loading compiled code ")
+"""Beginnings of notes that a run prints on a busy machine only."""
 
 
 def command(*arguments: object, cwd: Path = ROOT, **environment: str) -> subprocess.CompletedProcess[str]:

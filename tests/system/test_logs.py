@@ -8,7 +8,7 @@ import re
 import pytest
 
 from es_service import api
-from tests.system.command_line import command
+from tests.system.command_line import COMPILES, command
 from tests.system.session import SMALL
 
 SHORT = SMALL | {"budget": {"generations": 2}}
@@ -19,7 +19,7 @@ def test_every_record_of_a_run_carries_its_id_and_its_generation(tmp_path, caplo
         outcome = api.run(SHORT, tmp_path / "run")
     assert {record.run for record in caplog.records} == {outcome.run.run_id}
     session = [record for record in caplog.records if record.name == "es_service.runs.session"]
-    generations = [record.generation for record in session if not record.getMessage().startswith("compiling ")]
+    generations = [record.generation for record in session if not f"note: {record.getMessage()}".startswith(COMPILES)]
     assert generations == [0, 0, 0, 1, 2, 3]  # twice at the beginning; generations 0 to 2; the end, before 3
     committed = [record for record in caplog.records if record.name == "es_service.store.writer"]
     assert [record.generation for record in committed] == [0, 1, 2]
@@ -38,7 +38,7 @@ def test_a_record_outside_a_run_belongs_to_none(caplog):
 
 def others(printed: str) -> list[str]:
     """The lines that do not say that the run compiles, as it may on a busy machine."""
-    return [line for line in printed.splitlines() if not line.startswith("note: compiling ")]
+    return [line for line in printed.splitlines() if not line.startswith(COMPILES)]
 
 
 def test_the_command_line_is_quiet_unless_it_is_told_otherwise(config, tmp_path):

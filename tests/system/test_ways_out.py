@@ -29,7 +29,7 @@ from es_service.store.writer import RunStore
 from tests.database import execute
 from tests.es_service.store_examples import flip_bit, without_root_rights
 from tests.run_examples import write_run
-from tests.system.command_line import PROGRAM, command
+from tests.system.command_line import COMPILES, PROGRAM, command
 from tests.system.processes import running, wait_until
 from tests.system.session import SMALL
 
@@ -43,7 +43,7 @@ def words_after(text: str, verb: str) -> list[str]:
 
 def next_line(output) -> str:
     """The next line that a run prints; on a busy machine, it may first say that it compiles."""
-    return next(line for line in output if not line.startswith("note: compiling "))
+    return next(line for line in output if not line.startswith(COMPILES))
 
 
 def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
