@@ -25,6 +25,7 @@ from es_service.loop.parts import (
     WEIGHT,
     centre_part,
 )
+from es_service.search.state_parts import APPENDED_PREFIX, BY_CELL_PREFIX, PIECE
 
 INTEGER, REAL, BOOL = "iu", "f", "b"
 """Kinds of a `dtype`."""
@@ -75,7 +76,8 @@ def problem(part: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
     """In which way the content of a part is none of a run of these sizes; empty if it is one."""
     kind = next((prefix for prefix in _NUMBERED if part.startswith(prefix)), part)
     if kind not in _KINDS:
-        return ""
+        number = part.partition(PIECE)[2] if part.startswith((APPENDED_PREFIX, BY_CELL_PREFIX)) else ""
+        return "" if not number or number.isdecimal() else f"{part} has no number at its end"
     needed, more = _KINDS[kind], _MORE.get(kind, {})
     if kind == CENTRE_PREFIX:
         needed, more = {**needed, **sizes.step}, dict.fromkeys(arrays, _ANY)

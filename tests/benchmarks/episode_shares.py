@@ -93,11 +93,14 @@ def measure(task: str) -> dict[str, float]:
     carry = jax.eval_shape(steps.begin, key)
     words, actions = sum(map(words_of, jax.tree.leaves(carry))), spec.policy.outputs
 
-    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.look)(carry, inputs, inputs))
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.normalised_observation)(carry, inputs, inputs))
     sources = [("carry", words), ("constants", len(inputs_O)), ("constants", len(inputs_O))]
     look = graph_function("look", graph, outputs, sources, "seen", target)
-    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.move)(carry, inputs, action, key))
-    sources = [("carry", words), ("constants", len(inputs_O)), ("action", actions), ("keys", KEY_WORDS)]
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.advance)(carry, inputs, inputs, action, key))
+    sources = [
+        *(("carry", words), ("constants", len(inputs_O)), ("seen", len(inputs_O))),
+        *(("action", actions), ("keys", KEY_WORDS)),
+    ]
     move = graph_function("move", graph, outputs, sources, "carry", target)
 
     rng = np.random.default_rng(0)
@@ -131,9 +134,9 @@ def measure(task: str) -> dict[str, float]:
     without_noise = run_of([policy_function(network, "shared")], call, names)(*arrays)
     call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %noise, float %unit, ptr %hidden, ptr %action)"
     parts["policy"] = run_of([policy_function(network, "perturbed")], call, names)(*arrays, unit=unit)
-    call = "call void @move(ptr %carry, ptr %constants, ptr %action, ptr %keys)"
-    parts["move"] = run_of([move], call, ["carry", "constants", "action", "keys"])(
-        carries, constants, acted, keys, times=200
+    call = "call void @move(ptr %carry, ptr %constants, ptr %seen, ptr %action, ptr %keys)"
+    parts["move"] = run_of([move], call, ["carry", "constants", "seen", "action", "keys"])(
+        carries, constants, seen, acted, keys, times=200
     )
     parts["noise"] = filled / spec.episode_steps
     weights = network.noise_bytes

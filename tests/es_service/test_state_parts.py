@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from es_service.loop import forms
 from es_service.search.state_parts import BLOCK_ROWS, Appended, ByCell, Whole, changes, from_parts, problem, read_only
 
 
@@ -80,3 +81,9 @@ def test_arrays_are_read_only_with_those_of_which_they_are_views():
 def test_what_cannot_be_stored_is_named(value, why):
     assert why in problem({"b": np.zeros(1), "a": value})
     assert problem({"a": np.float32(1), "b": rows(1), "c": ByCell({0: {"x": np.zeros(1)}}), "d": Whole({})}) == ""
+
+
+@pytest.mark.parametrize(("name", "is_right"), [("cells_a/00000005", True), ("cells_a", True), ("rows_a/5x", False)])
+def test_a_stored_piece_ends_with_its_number(name, is_right):
+    found = forms.problem(name, {}, forms.Sizes(1, 1, 1, None, ()))
+    assert found == ("" if is_right else f"{name} has no number at its end")
