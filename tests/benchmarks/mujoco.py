@@ -47,6 +47,9 @@ SIDES = ("simd", "c", "c_own", "xla")
 """Columns of rates: ours, `mujoco.rollout` with the same settings and with its own, and xla."""
 
 
+ERRORS = ("contact_median", "contact_p99", "contact_max", "free_p99", "ulp_p99")
+
+
 def rows() -> dict[str, Callable[[Path | None], Any]]:
     """Row -> its `Example`, or None if its files are not there, given the folder of Playground."""
     from tests import mujoco_models as models
@@ -237,7 +240,7 @@ def table(of: Path) -> str:
     head = (
         "| model, cores | degrees, constraints | simd, control steps/s | / C, same settings | / C, its own | / xla | "
         "from C's own: contact, median; 99 %; greatest | no contact, 99 %; C after one ulp, 99 % | "
-        "operations, code | compiled in |"
+        "operations, code | compiled in (of the processor) |"
     )
     lines = [head, "|" + " --- |" * 10]
 
@@ -251,12 +254,12 @@ def table(of: Path) -> str:
         if np.isnan(row["simd"]):
             lines.append(f"| {name} | {row['note']} |" + " |" * 8)
             continue
-        errors = [f"{row[key]:.1e}" for key in ("contact_median", "contact_p99", "contact_max")]
+        error = {key: "-" if np.isnan(row.get(key, np.nan)) else f"{row[key]:.1e}" for key in ERRORS}
         cells = [
             name, f"{row['nv']:.0f}, {row['constraints']:.0f}", f"{row['simd']:,.0f}",
             *(times(row, side) for side in SIDES[1:]),
-            "; ".join(errors), f"{row['free_p99']:.1e}; {row['ulp_p99']:.1e}",
-            f"{row['operations']:,.0f}, {row['code_kb']:.0f} kB", f"{row['cold_s']:.0f} s",
+            "; ".join(error[key] for key in ERRORS[:3]), "; ".join(error[key] for key in ERRORS[3:]),
+            f"{row['operations']:,.0f}, {row['code_kb']:.0f} kB", f"{row['cold_s']:.0f} s ({row['cold_cpu_s']:.0f})",
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
