@@ -44,7 +44,8 @@ class TaskBraxEnv(Env):
         """Make the functions of the task.
 
         Args:
-            task: a shipped task (point_maze, ant_maze, ant_trap), `brax:NAME`, or module:Class of a class in JAX.
+            task: a shipped task (point_maze, ant_maze, ant_trap), `brax:NAME`, `mujoco:ID`, or module:Class of a class
+                in JAX.
             task_options: options of the task, such as {"start": "corner"}.
 
         Raises:

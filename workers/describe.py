@@ -53,7 +53,7 @@ def main(name: str, settings: str, file: str) -> None:
         if task.kind == "python":
             options = option_values(task.options, given.get("options", {}))
             task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options))
-        elif task.kind == "jax" and not name.startswith("brax:"):
+        elif task.kind == "jax" and not name.startswith(("brax:", "mujoco:")):
             from workers.traces import require_pure
 
             require_pure(task, option_values(task.options, given.get("options", {})))

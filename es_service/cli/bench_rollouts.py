@@ -52,7 +52,7 @@ def bench_rollouts(
     for task in tasks:
         if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, gymnasium:ID, "
+                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, mujoco:ID, gymnasium:ID, "
                 f"python:module:Class, function:module:name, or module:Class"
                 f"{did_you_mean_task(task, TASKS)}"
             )

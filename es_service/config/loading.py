@@ -203,7 +203,7 @@ def _load(
             "task.environment",
             "task",
             tasks,
-            "brax:NAME, gymnasium:ID, python:module:Class, function:module:name, or module:Class",
+            "brax:NAME, mujoco:ID, gymnasium:ID, python:module:Class, function:module:name, or module:Class",
         ),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):

@@ -33,8 +33,8 @@ DESCRIBE_S = 120.0
 
 
 class Tasks(Mapping[str, TaskSpec]):
-    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `gymnasium:ID`,
-    `module:Class`, `python:module:Class` and `function:module:name`."""
+    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `mujoco:ID`,
+    `gymnasium:ID`, `module:Class`, `python:module:Class` and `function:module:name`."""
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""

@@ -117,12 +117,12 @@ def why_refused(expected: Sources, names: Sequence[str], platform: str = "any") 
 def user_path(name: str) -> str:
     """The code of a user that a name in a config means, as `package.module:name`; empty if it means none.
 
-    `brax:NAME` is none. What is simulated by Python has the kind of the task before the path, as in
+    `brax:NAME` and `mujoco:ID` are none. What is simulated by Python has the kind of the task before the path, as in
     `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module that
     registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace.
     """
     kind, colon, rest = name.partition(":")
-    if kind == "brax":
+    if kind in ("brax", "mujoco"):
         return ""
     if kind == LIBRARY:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")

@@ -185,7 +185,7 @@ def test_a_cluster_without_ray_is_refused():
         (MINIMAL_TEXT + "seed: 1\nseed: 2\n", 'line 5, column 1: found duplicate key "seed" with value "2"'),
         (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: a key in a file has no dots; write hidden"),
         (MINIMAL_TEXT.replace("algorithm: es", "preset: uber"), "search.algorithm: missing; must be es, or module:"),
-        (MINIMAL_TEXT.partition("\n")[2], "environment: missing; must be point_maze or no_final, or brax:NAME, gy"),
+        (MINIMAL_TEXT.partition("\n")[2], "environment: missing; must be point_maze or no_final, or brax:NAME, mu"),
         (MINIMAL_TEXT.replace("es}", "es, sigma: 1, sigma: 2}"), 'found duplicate key "sigma" with value "2" (o'),
         (MINIMAL_TEXT.replace("maze}", "maze, options: }"), "task.options: null is not a mapping of keys"),
         ("- 1\n", "the top level is [1]; write sections such as `task:`"),

@@ -113,7 +113,7 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     """Functions of a task; imports its module, and with it JAX and the physics engine that it needs.
 
     Args:
-        name: a key of SHIPPED, `brax:NAME` or `package.module:Class`.
+        name: a key of SHIPPED, `brax:NAME`, `mujoco:ID` or `package.module:Class`.
         options: options of the task and their values.
 
     Raises:
@@ -126,6 +126,10 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
         from workers.environments import brax_task
 
         return brax_task.make(rest, **options)
+    if prefix == "mujoco":
+        from workers.environments import mujoco_gym
+
+        return mujoco_gym.make(rest, **options)
     from workers.environments import user_task
 
     return user_task.make(name, options)
@@ -196,8 +200,8 @@ def settings_of_description(
 
 
 def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:
-    """Description of a task that is no shipped one, from its module. Only `brax:NAME` and `package.module:Class` import
-    JAX.
+    """Description of a task that is no shipped one, from its module. Only `brax:NAME`, `mujoco:ID` and
+    `package.module:Class` import JAX.
 
     Args:
         settings: `settings_of_description`, and `options` with which it is tried if they are not the defaults.
@@ -211,6 +215,10 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         from workers.environments import brax_task
 
         return brax_task.describe(rest, options)
+    if kind == "mujoco":
+        from workers.environments import mujoco_gym
+
+        return mujoco_gym.describe(rest, options)
     if is_host_task(name):
         chosen = settings.get("descriptor")
         descriptor = tuple(chosen) if isinstance(chosen, list) else chosen

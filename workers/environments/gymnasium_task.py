@@ -97,7 +97,7 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
 
 def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
     """The environment with the ID `name` as a task of Python objects."""
-    gymnasium, spec, task = _gymnasium(), copy.deepcopy(_registered(name)), f"{LIBRARY}:{name}"
+    gymnasium, spec, task = gymnasium_package(), copy.deepcopy(_registered(name)), f"{LIBRARY}:{name}"
     if wrong := [f"task.options.{key} = {options[key]!r}: {why}" for key, why in OURS.items() if key in options]:
         raise TaskError("; ".join(wrong))
     spec.order_enforce = False  # a wrapper that would check the order of calls
@@ -128,7 +128,8 @@ def _refused(task: str, what: str, options: Mapping[str, OptionValue], error: Ba
     return TaskError(f"{task} cannot {what} with the options {dict(options)}: {why}")
 
 
-def _gymnasium() -> Any:
+def gymnasium_package() -> Any:
+    """The package gymnasium. Raises TaskError if it is not installed."""
     try:
         import gymnasium
     except ModuleNotFoundError:
@@ -141,7 +142,7 @@ def _gymnasium() -> Any:
 
 def _registered(name: str) -> Any:
     """The specification under which an environment is registered, after its module has been imported."""
-    gymnasium, own = _gymnasium(), user_path(f"{LIBRARY}:{name}")
+    gymnasium, own = gymnasium_package(), user_path(f"{LIBRARY}:{name}")
     module = own.partition(":")[0]
     try:
         if own and (":" in name or _exists(module)):
@@ -165,7 +166,7 @@ def _exists(module: str) -> bool:
 
 
 def _is(space: Any, kind: str) -> bool:
-    return isinstance(space, getattr(_gymnasium().spaces, kind))
+    return isinstance(space, getattr(gymnasium_package().spaces, kind))
 
 
 def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:

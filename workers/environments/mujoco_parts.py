@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +28,7 @@ mujoco: Any = importlib.import_module("mujoco")  # its module does not say what 
 with quietly():
     from mujoco import mjx
     from mujoco.mjx._src import collision_driver, support, types
+    from mujoco.mjx._src import forward as forward_of_mjx
 
 MjModel = Any
 """A model of C MuJoCo, `mujoco.MjModel`."""
@@ -101,12 +102,66 @@ def step(model: mjx.Model, state: MujocoState, ctrl: Any, substeps: int = 1) -> 
         ctrl: [nu] controls, which MuJoCo clips to their ranges, and which are the same in all substeps.
         substeps: steps of `opt.timestep` in a control step.
     """
+    return step_and_look(model, state, ctrl, substeps, lambda data: ())[0]
+
+
+def step_and_look(
+    model: mjx.Model, state: MujocoState, ctrl: Any, substeps: int, look: Callable[[mjx.Data], Any]
+) -> tuple[MujocoState, Any]:
+    """As `step`, with what a function sees in the data of the last substep.
+
+    As in C MuJoCo, all in the data but `qpos`, `qvel`, `act` and `time` is what the last computation of forces found:
+    that of the state before the substep, or with RK4 that of its fourth stage.
+
+    Args:
+        look: function from data to a pytree of arrays.
+    """
     empty = mjx.make_data(model)
+    integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _mjx_step
 
-    def substep(state: MujocoState, _: None) -> tuple[MujocoState, None]:
-        return _state(mjx.step(model, _data(empty, state, ctrl))), None
+    def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
+        return integrate(model, _data(empty, before[0], ctrl), look), None
 
-    return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, None, length=substeps)[0]
+    first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
+    begun = state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
+    return substep(begun, None)[0] if substeps == 1 else jax.lax.scan(substep, begun, None, length=substeps)[0]
+
+
+def _mjx_step(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
+    data = mjx.step(model, data)
+    return _state(data), look(data)
+
+
+STAGES = np.array([[0.0, 0.5, 0.5, 1.0], np.array([1, 2, 2, 1]) / 6]).T
+"""Of each stage of RK4: how far its state is along the step, by the rates of the stage before, and its weight."""
+
+
+def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
+    """A substep of RK4, and what is seen in its fourth stage.
+
+    It is MJX's with the stages in a loop: four copies of the physics take four times as long to compile.
+    """
+    advanced = forward_of_mjx._advance
+
+    def moved(rates: tuple[Any, Any, Any], share: Any) -> mjx.Data:
+        """Data with the state after a share of a step with these rates of (qpos, qvel, act)."""
+        qvel, qacc, act_dot = jax.tree.map(lambda rate: share * rate, rates)
+        return advanced(model, data, act_dot, qacc, qvel)
+
+    def stage(carry: tuple[Any, Any, Any], numbers: Any) -> tuple[tuple[Any, Any, Any], None]:
+        rates, sums, _ = carry
+        at = moved(rates, numbers[0])
+        found = mjx.forward(model, at.replace(qacc_warmstart=data.qacc_warmstart))
+        rates = found.qvel, found.qacc, found.act_dot
+        sums = jax.tree.map(lambda total, rate: total + numbers[1] * rate, sums, rates)
+        return (rates, sums, (found.qacc, look(found))), None
+
+    still = jax.tree.map(jnp.zeros_like, (data.qvel, data.qacc, data.act_dot))
+    shapes = jax.eval_shape(lambda: stage((still, still, None), STAGES[0])[0][2])
+    unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    stages = jnp.asarray(STAGES, data.qvel.dtype)
+    (_, rates, (qacc, seen)), _ = jax.lax.scan(stage, (still, still, unseen), stages)
+    return _state(moved(rates, 1.0).replace(qacc_warmstart=qacc)), seen
 
 
 def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:

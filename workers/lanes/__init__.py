@@ -37,13 +37,14 @@ class LanesState(NamedTuple):
 
 
 def task_named(name: str, options: Mapping[str, OptionValue]) -> TaskSpec:
-    """Description of a task: a shipped one, `brax:NAME`, or module:Class of a class in JAX.
+    """Description of a task: a shipped one, `brax:NAME`, `mujoco:ID`, or module:Class of a class in JAX.
 
     Raises:
         TaskError: there is no such task, it has no such option, or it is of a kind that is no such environment.
     """
     if not isinstance(name, str) or (":" not in name and name not in SHIPPED):
-        raise TaskError(f"task = {name!r} is not shipped; choose among {', '.join(SHIPPED)}, brax:NAME or module:Class")
+        others = "brax:NAME, mujoco:ID or module:Class"
+        raise TaskError(f"task = {name!r} is not shipped; choose among {', '.join(SHIPPED)}, {others}")
     if is_host_task(name):
         raise TaskError(f"task = {name!r} is a Python object, no task in JAX; step it by itself")
     if is_function_task(name):

@@ -21,6 +21,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     for task in known_tasks.values():
         tasks.add_row(task.name, _about(task))
     tasks.add_row("brax:NAME", "any environment of the installed Brax")
+    tasks.add_row("mujoco:ID", "an environment of Gymnasium by MJX, such as mujoco:Ant-v5")
     tasks.add_row("gymnasium:ID", "an environment of Gymnasium, with Box or Discrete spaces")
     tasks.add_row("module:Class", "a task of your own in JAX; see workers/README.md")
     tasks.add_row("python:module:Class", "a task of your own in Python: an object with reset and step")

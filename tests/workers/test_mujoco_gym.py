@@ -1,0 +1,169 @@
+"""Gymnasium's environments of MuJoCo by MJX, one control step against Gymnasium itself; what is not supported is named.
+
+A state that moves by one float32 ulp shows how exact a comparison can be: Gymnasium's own answer moves, too.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+from es_service.protocol.messages import with_options
+from es_service.protocol.noise import Domain, stream_keys
+from tests.mujoco_models import relative_error
+from workers.environments import TaskError, describe_environment, make_environment, mujoco_gym
+from workers.environments.mujoco_gym_tasks import REFUSED, TASKS
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.graph.unsupported import UnsupportedError
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")]
+KEYS = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(256))
+TIMES = 8.0
+"""Errors may be so many times as great as what one ulp of a state makes in Gymnasium: a step rounds thousands of
+times."""
+LONGEST = 60
+"""Most steps with random actions after which a state is compared."""
+NOT_OURS = {"self", "xml_file", "default_camera_config", "frame_skip", "kwargs"}
+
+
+class Steps(NamedTuple):
+    """What control steps from N states give."""
+
+    observation: np.ndarray
+    reward: np.ndarray
+    done: np.ndarray
+
+
+def random_states(name: str, count: int) -> list[np.ndarray]:
+    """[qpos, qvel, action in [-1, 1]] of random episodes of Gymnasium, in float32."""
+    environment, rng = gymnasium.make(name).unwrapped, np.random.default_rng(0)
+    space, rows = environment.action_space, []
+    for seed in range(count):
+        environment.reset(seed=seed)
+        for _ in range(rng.integers(LONGEST)):
+            environment.step(rng.uniform(space.low, space.high))
+        rows.append((environment.data.qpos.copy(), environment.data.qvel.copy(), rng.uniform(-1, 1, space.shape)))
+    return [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+
+
+def steps_of_gymnasium(name: str, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray) -> tuple[Steps, np.ndarray]:
+    """(control steps, numbers of contacts after them)."""
+    environment, rows = gymnasium.make(name).unwrapped, []
+    low, high = environment.action_space.low, environment.action_space.high
+    for q, v, a in zip(qpos, qvel, action, strict=True):
+        environment.reset(seed=0)
+        environment.set_state(q.astype(float), v.astype(float))
+        observation, reward, done, _, _ = environment.step((low + high) / 2 + (high - low) / 2 * a)
+        rows.append((observation, reward, done, environment.data.ncon))
+    *steps, contacts = (np.array(column) for column in zip(*rows, strict=True))
+    return Steps(*steps), contacts
+
+
+def steps_of_ours(name: str, given: list[np.ndarray], **options: Any) -> Steps:
+    """By simd, or by xla if simd cannot, in float32."""
+    environment, built = make_environment(f"mujoco:{name}", options), mujoco_gym.build(name, **options)
+
+    def step(qpos: Any, qvel: Any, action: Any) -> tuple[Any, Any, Any]:
+        after, reward, done = environment.step(built.at(qpos, qvel), action)
+        return environment.observe(after), reward, done
+
+    try:
+        kernel = compile_kernel(step, *(jax.ShapeDtypeStruct(x.shape[1:], np.float32) for x in given))
+    except UnsupportedError:  # that of the ant is too large
+        kernel = jax.jit(jax.vmap(step))
+    return Steps(*map(np.asarray, kernel(*given)))
+
+
+def compare(name: str, count: int) -> None:
+    """99 % of errors are at most TIMES the greatest that one ulp makes in Gymnasium, with its unit 1e-6."""
+    given, rng = random_states(name, count), np.random.default_rng(1)
+    (truth, contacts), found, moved = steps_of_gymnasium(name, *given), steps_of_ours(name, given), []
+    for _ in range(4):
+        qpos, qvel = (
+            np.nextafter(x, np.where(rng.random(x.shape) < 0.5, -9e9, 9e9).astype(x.dtype)) for x in given[:2]
+        )
+        moved.append(steps_of_gymnasium(name, qpos, qvel, given[2])[0])
+    print(f"\n{name}: {count} states, {int((contacts > 0).sum())} in contact, {int(truth.done.sum())} ends")
+    for what in ("observation", "reward"):
+        right = getattr(truth, what).reshape(count, -1)
+        error, *ulps = (relative_error(getattr(of, what).reshape(count, -1), right) for of in (found, *moved))
+        ulp = np.maximum.reduce(ulps)
+        print(what, *(f"{np.quantile(of, share):.1e}" for of in (error, ulp) for share in (0.5, 0.99, 1.0)))
+        assert np.quantile(error, 0.99) <= TIMES * (ulp.max() + 1e-6), what
+    at_the_edge = np.any([of.done != truth.done for of in moved], axis=0)
+    np.testing.assert_array_equal(found.done[~at_the_edge], truth.done[~at_the_edge])
+
+
+@pytest.mark.parametrize("name", ["InvertedDoublePendulum-v5", "HalfCheetah-v5"])
+def test_a_control_step_is_gymnasiums(name: str):
+    compare(name, 50)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", TASKS)
+def test_a_control_step_of_any_task_is_gymnasiums(name: str):
+    compare(name, 1000)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_options_have_the_names_and_defaults_of_gymnasium(name: str):
+    of_class = inspect.signature(type(gymnasium.make(name).unwrapped).__init__).parameters
+    gyms = {key: one.default for key, one in of_class.items() if key not in NOT_OURS}
+    ours = inspect.signature(TASKS[name].parts).parameters
+    assert {key: one.default for key, one in ours.items() if key != "model"} == gyms
+    assert TASKS[name].frame_skip == of_class["frame_skip"].default
+    assert TASKS[name].episode_steps == gymnasium.spec(name).max_episode_steps
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Swimmer-v5", "Reacher-v5"])
+def test_resets_have_gymnasiums_distributions(name: str):
+    """The range, the mean and the spread of each number of an observation, in as many resets of both."""
+    environment, theirs = make_environment(f"mujoco:{name}", {}), gymnasium.make(name).unwrapped
+    observed = compile_kernel(lambda key: environment.observe(environment.reset(key)), KEYS[0])(KEYS)
+    gyms = np.array([theirs.reset(seed=seed)[0] for seed in range(len(KEYS))])
+    assert observed.shape == gyms.shape
+    spread = gyms.std(0)
+    np.testing.assert_allclose(observed.std(0), spread, rtol=0.2, atol=1e-6)
+    assert (np.abs(observed.mean(0) - gyms.mean(0)) <= 0.4 * spread + 1e-6).all()
+    assert (np.abs(observed).max(0) <= np.abs(gyms).max(0) + spread + 1e-6).all()
+
+
+def test_a_task_says_its_sizes_and_options():
+    task = describe_environment("mujoco:HalfCheetah-v5")
+    assert (task.observation_size, task.action_size, task.episode_steps) == (17, 6, 1000)
+    assert tuple(task.descriptors) == ("final_x", "final_joints")
+    assert task.options["solver_iterations"].default == 100
+    assert with_options(task, {"descriptor": "final_joints"}).descriptor_names == ("joint_1", "joint_2")
+    more = describe_environment(
+        "mujoco:HalfCheetah-v5", {"options": {"exclude_current_positions_from_observation": False}}
+    )
+    assert more.observation_size == 18
+    assert tuple(describe_environment("mujoco:Swimmer-v5").descriptors) == ("final_xy", "final_x", "final_joints")
+    assert tuple(describe_environment("mujoco:Reacher-v5").descriptors) == ("final_joints",)
+    assert tuple(mujoco_gym._descriptors(mujoco_gym.load(TASKS["Ant-v5"]))) == ("final_xy", "final_x", "final_joints")
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_mjx_cannot_do_is_refused_with_a_way_out(name: str):
+    with pytest.raises(TaskError, match=f"mujoco:{name} is not supported, because MJX .*; use gymnasium:{name} inst"):
+        describe_environment(f"mujoco:{name}")
+
+
+def test_what_cannot_be_had_is_named(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(
+        TaskError, match=r"mujoco:Ants-v5 is not known; must be Ant-v5, .*; did you mean mujoco:Ant-v5\?"
+    ):
+        describe_environment("mujoco:Ants-v5")
+    with pytest.raises(TaskError, match=r"task\.options\.healthy_z_range = \[1\] is not allowed; must be two numbers"):
+        describe_environment("mujoco:Walker2d-v5", {"options": {"healthy_z_range": [1]}})
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(
+        TaskError, match=r"the package gymnasium is not installed; .*pip install 'es-service\[gymnasium\]'"
+    ):
+        describe_environment("mujoco:Swimmer-v5")

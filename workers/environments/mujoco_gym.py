@@ -1,0 +1,213 @@
+"""Gymnasium's environments of MuJoCo as tasks in JAX, such as `mujoco:Ant-v5`.
+
+The models are the XML files of Gymnasium's package, and the physics is MJX's, with the timestep, the integrator and the
+solver that the files name. The solver has the iterations of the files, unless the option `solver_iterations` says
+otherwise. Observations, rewards, ends and resets are in `mujoco_gym_tasks.py`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from es_service.protocol.messages import Bounds, TaskSpec
+from es_service.protocol.options import Option, OptionValue, choice
+from workers.environments import Environment, TaskError
+from workers.environments.brax_parts import Transform, quietly
+from workers.environments.gymnasium_task import gymnasium_package
+from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, GymState, GymTask, Parts, Simulated
+from workers.environments.mujoco_parts import MjModel, forward, mujoco, put_model, start, step_and_look
+from workers.viewer import Viewer
+
+FAR = 30.0
+"""Bound of descriptors whose range is not specified, in metres or in the unit of the joint."""
+JOINTS = 2
+"""Most joints in the descriptor `final_joints`; they are the first joints of the model."""
+
+
+def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
+    """Description of Gymnasium's environment `name` as a task.
+
+    Args:
+        given: values of options that are not the defaults; the size of an observation depends on them.
+
+    Raises:
+        TaskError: there is no such environment here, the package with its model is not installed, or a value of an
+            option cannot be used.
+    """
+    task = _task(name)
+    model = load(task)
+    values: dict[str, Any] = dict(given)
+    environment = make(name, **values)
+    state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
+    descriptors = {kind: (names, bounds) for kind, (names, bounds, _) in _descriptors(model).items()}
+    names, bounds = next(iter(descriptors.values()))
+    return TaskSpec(
+        name=f"mujoco:{name}",
+        observation_size=jax.eval_shape(environment.observe, state).shape[0],
+        action_size=model.nu,
+        episode_steps=task.episode_steps,
+        descriptor_names=names,
+        descriptor_bounds=bounds,
+        final_fitness=False,
+        has_goal=False,
+        options={
+            "descriptor": choice(*descriptors),
+            "frame_skip": Option(task.frame_skip, low=1),
+            "solver_iterations": Option(model.opt.iterations, low=1),
+            **{key: _option(value) for key, value in _defaults(task).items()},
+        },
+        descriptors=descriptors,
+        summary=f"{name} of Gymnasium, computed by MJX",
+    )
+
+
+def make(
+    name: str,
+    descriptor: str | None = None,
+    frame_skip: int | None = None,
+    solver_iterations: int | None = None,
+    **options: Any,
+) -> Environment:
+    """Functions of Gymnasium's environment `name`.
+
+    Args:
+        descriptor: the first of the model if None.
+        frame_skip: substeps of a control step; Gymnasium's if None.
+        solver_iterations: most iterations of the solver of the constraints; those of the model if None. It ends earlier
+            when it has converged.
+        options: options of Gymnasium's environment.
+
+    Raises:
+        TaskError: as `describe`.
+    """
+    of = build(name, frame_skip, solver_iterations, **options)
+    (model, mx, substeps, step_s), parts = of.simulated, of.parts
+    descriptors = _descriptors(model)
+    *_, places = descriptors[descriptor or next(iter(descriptors))]
+    low_A, high_A = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    middle_A, half_A = 0.5 * low_A + 0.5 * high_A, 0.5 * high_A - 0.5 * low_A
+
+    def reset(key: Any) -> GymState:
+        return of.at(*parts.start(key))
+
+    def step(state: GymState, action: Any) -> tuple[GymState, Any, Any]:
+        bounded_A = jnp.clip(middle_A + half_A * action, low_A, high_A)
+        after = GymState(*step_and_look(mx, state.physics, bounded_A, substeps, lambda data: parts.look(data, True)))
+        return after, *parts.outcome(state, after, bounded_A)
+
+    def poses(state: GymState) -> Transform:
+        data = forward(mx, state.physics, jnp.zeros(model.nu))
+        return Transform(data.xpos[1:], data.xquat[1:])
+
+    return Environment(
+        reset,
+        parts.observe,
+        step,
+        lambda state: state.physics.qpos[places],
+        lambda state: jnp.float32(jnp.nan),
+        viewer=Viewer(model, poses, step_s),
+    )
+
+
+class Built(NamedTuple):
+    """An environment with values of its options."""
+
+    simulated: Simulated
+    parts: Parts
+
+    def at(self, qpos: Any, qvel: Any) -> GymState:
+        """A state with these positions [nq] and velocities [nv], as Gymnasium's `set_state` after a reset."""
+        physics = start(self.simulated.mx, qpos, qvel)
+        data = forward(self.simulated.mx, physics, jnp.zeros(self.simulated.c.nu))
+        return GymState(physics, self.parts.look(data, False))
+
+
+def build(name: str, frame_skip: int | None = None, solver_iterations: int | None = None, **options: Any) -> Built:
+    """Gymnasium's environment `name`; arguments as of `make`."""
+    task = _task(name)
+    model, substeps = load(task), frame_skip or task.frame_skip
+    model.opt.iterations = solver_iterations or model.opt.iterations
+    simulated = Simulated(model, put_model(model), substeps, substeps * model.opt.timestep)
+    defaults = _defaults(task)
+    ranges = {key: _range(key, value) for key, value in options.items() if isinstance(defaults[key], tuple)}
+    return Built(simulated, task.parts(simulated, **{**options, **ranges}))
+
+
+def load(task: GymTask) -> MjModel:
+    """C MuJoCo's model of an environment, from Gymnasium's package.
+
+    Raises:
+        TaskError: the package is not installed.
+    """
+    file = Path(gymnasium_package().__file__).parent / "envs" / "mujoco" / "assets" / task.file
+    with quietly():
+        return mujoco.MjModel.from_xml_path(str(file))
+
+
+def _task(name: str) -> GymTask:
+    if name in TASKS:
+        return TASKS[name]
+    if name in REFUSED:
+        raise TaskError(f"mujoco:{name} is not supported, because {REFUSED[name]}; use gymnasium:{name} instead")
+    near = get_close_matches(name, [*TASKS, *REFUSED], n=1)
+    hint = f"; did you mean mujoco:{near[0]}?" if near else ""
+    raise TaskError(f"mujoco:{name} is not known; must be {', '.join(TASKS)}{hint}")
+
+
+def _defaults(task: GymTask) -> dict[str, Any]:
+    """Options of Gymnasium's environment and their defaults."""
+    named = inspect.signature(task.parts).parameters.values()
+    return {one.name: one.default for one in named if one.kind is one.KEYWORD_ONLY}
+
+
+def _option(default: Any) -> Option:
+    """A range has no default here, as with `gymnasium:ID`, since it may be infinite, which a config cannot say."""
+    return Option(None if isinstance(default, tuple) else default)
+
+
+def _range(key: str, value: Any) -> tuple[float, float]:
+    """A range that a config gives.
+
+    Raises:
+        TaskError: it is none.
+    """
+    is_pair = isinstance(value, list) and len(value) == 2 and all(type(bound) in (int, float) for bound in value)
+    if not is_pair or not -math.inf < value[0] <= value[1] < math.inf:
+        raise TaskError(f"task.options.{key} = {value!r} is not allowed; must be two numbers [low, high]")
+    return float(value[0]), float(value[1])
+
+
+def _descriptors(model: MjModel) -> dict[str, tuple[tuple[str, ...], Bounds, Any]]:
+    """Descriptors of a model: name -> (names of the dimensions, bounds, their places among the positions).
+
+    The first is the default.
+    """
+    descriptors: dict[str, tuple[tuple[str, ...], Bounds, Any]] = {}
+    root, along = _root(model)
+    for kind, axes in (("final_xy", "xy"), ("final_x", "x")):
+        if along[: len(axes)] == axes:
+            descriptors[kind] = tuple(axes), ((-FAR, FAR),) * len(axes), np.arange(len(axes))
+    if joints := min(JOINTS, model.nq - root):
+        names = tuple(f"joint_{number}" for number in range(1, joints + 1))
+        descriptors["final_joints"] = names, ((-FAR, FAR),) * joints, np.arange(root, root + joints)
+    return descriptors
+
+
+def _root(model: MjModel) -> tuple[int, str]:
+    """(leading positions that are the place of a moving base, axes of the world along which the first of them move)."""
+    kinds = model.jnt_type[model.jnt_bodyid == 1].tolist()
+    if kinds[:1] == [mujoco.mjtJoint.mjJNT_FREE]:
+        return 7, "xyz"
+    slides = [at for at, kind in enumerate(kinds) if kind == mujoco.mjtJoint.mjJNT_SLIDE]
+    along = "".join("xyz"[int(np.argmax(np.abs(model.jnt_axis[at])))] for at in slides)
+    return (len(kinds) if slides else 0), along

@@ -1,0 +1,326 @@
+"""What Gymnasium's environments of MuJoCo begin with, observe, reward and end with, version 5: a function for each.
+
+Names and defaults of options are Gymnasium's, whose classes these functions repeat; a test compares both. `TASKS` has
+the file of the model and the frame skip of each, and `mujoco_gym.py` makes tasks of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from es_service.protocol.noise import NORMAL_STD, normal_integers, uniforms
+from workers.environments.mujoco_parts import MjModel, MujocoState, mjx, mujoco
+
+Range = tuple[float, float]
+"""(low, high)."""
+
+
+class Simulated(NamedTuple):
+    """A model, and what a control step of it is."""
+
+    c: MjModel
+    mx: mjx.Model
+    frame_skip: int
+    """Substeps of a control step."""
+    step_s: float
+    """Seconds of a control step."""
+
+    def body(self, name: str) -> int:
+        return mujoco.mj_name2id(self.c, mujoco.mjtObj.mjOBJ_BODY, name)
+
+
+class GymState(NamedTuple):
+    """State of an environment of Gymnasium between two control steps."""
+
+    physics: MujocoState
+    seen: Any
+    """What `look` of the task saw in the last computed substep, any pytree."""
+
+
+class Parts(NamedTuple):
+    """An environment of Gymnasium as functions."""
+
+    start: Callable[[Any], tuple[Any, Any]]
+    """Function from a stream key to the positions [nq] and velocities [nv] of a reset."""
+    observe: Callable[[GymState], Any]
+    """Function from a state to an observation [O]."""
+    outcome: Callable[[GymState, GymState, Any], tuple[Any, Any]]
+    """Function (state, state after a control step, action within the bounds of its actuators) -> (reward, done)."""
+    look: Callable[[Any, bool], Any] = lambda data, stepped: ()
+    """Function (data, whether a step or a reset has computed it) to what a state keeps of MuJoCo's data.
+
+    Data after a step are those of the last forward computation in it: for RK4 its fourth, for Euler of the state before
+    the last substep, while positions and velocities are already those after it. Gymnasium reads them so."""
+
+
+class GymTask(NamedTuple):
+    """An environment of Gymnasium."""
+
+    file: str
+    """Name of the model's file in Gymnasium's package."""
+    frame_skip: int
+    parts: Callable[..., Parts]
+    """Function from a `Simulated` and options, by name."""
+    episode_steps: int = 1000
+
+
+def _ant(
+    model: Simulated,
+    *,
+    forward_reward_weight: float = 1.0,
+    ctrl_cost_weight: float = 0.5,
+    contact_cost_weight: float = 5e-4,
+    healthy_reward: float = 1.0,
+    main_body: int = 1,
+    terminate_when_unhealthy: bool = True,
+    healthy_z_range: Range = (0.2, 1.0),
+    contact_force_range: Range = (-1.0, 1.0),
+    reset_noise_scale: float = 0.1,
+    exclude_current_positions_from_observation: bool = True,
+    include_cfrc_ext_in_observation: bool = True,
+) -> Parts:
+    def look(data: Any, stepped: bool) -> Any:
+        """Place of the main body, and forces on the bodies, which a reset of Gymnasium leaves at 0."""
+        found: Any = mjx.rne_postconstraint(model.mx, data) if stepped else None
+        forces = found._impl.cfrc_ext if stepped else jnp.zeros((model.c.nbody, 6))
+        return data.xpos[main_body, :2], jnp.clip(forces, *contact_force_range)
+
+    def observe(state: GymState) -> Any:
+        (qpos, qvel, *_), (_, forces) = state
+        place = 2 if exclude_current_positions_from_observation else 0
+        return jnp.concatenate([qpos[place:], qvel, *([forces[1:].ravel()] if include_cfrc_ext_in_observation else [])])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        (place, _), (place_after, forces) = before.seen, after.seen
+        qpos, qvel = after.physics[:2]
+        low, high = healthy_z_range
+        healthy = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all() & (qpos[2] >= low) & (qpos[2] <= high)
+        velocity = (place_after[0] - place[0]) / model.step_s
+        reward = forward_reward_weight * velocity + healthy * healthy_reward
+        costs = ctrl_cost_weight * jnp.sum(action**2) + contact_cost_weight * jnp.sum(forces**2)
+        return reward - costs, ~healthy & terminate_when_unhealthy
+
+    return Parts(_noisy(model, reset_noise_scale, normal=True), observe, outcome, look)
+
+
+def _half_cheetah(
+    model: Simulated,
+    *,
+    forward_reward_weight: float = 1.0,
+    ctrl_cost_weight: float = 0.1,
+    reset_noise_scale: float = 0.1,
+    exclude_current_positions_from_observation: bool = True,
+) -> Parts:
+    start = _noisy(model, reset_noise_scale, normal=True)
+    hidden = 1 if exclude_current_positions_from_observation else 0
+    return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight)
+
+
+def _swimmer(
+    model: Simulated,
+    *,
+    forward_reward_weight: float = 1.0,
+    ctrl_cost_weight: float = 1e-4,
+    reset_noise_scale: float = 0.1,
+    exclude_current_positions_from_observation: bool = True,
+) -> Parts:
+    start = _noisy(model, reset_noise_scale)
+    hidden = 2 if exclude_current_positions_from_observation else 0
+    return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight)
+
+
+def _hopper(
+    model: Simulated,
+    *,
+    forward_reward_weight: float = 1.0,
+    ctrl_cost_weight: float = 1e-3,
+    healthy_reward: float = 1.0,
+    terminate_when_unhealthy: bool = True,
+    healthy_state_range: Range = (-100.0, 100.0),
+    healthy_z_range: Range = (0.7, float("inf")),
+    healthy_angle_range: Range = (-0.2, 0.2),
+    reset_noise_scale: float = 5e-3,
+    exclude_current_positions_from_observation: bool = True,
+) -> Parts:
+    def healthy(qpos: Any, qvel: Any) -> Any:
+        others = jnp.concatenate([qpos[2:], qvel])
+        upright = _inside(qpos[1], healthy_z_range) & _inside(qpos[2], healthy_angle_range)
+        return upright & _inside(others, healthy_state_range).all()
+
+    start = _noisy(model, reset_noise_scale)
+    hidden = 1 if exclude_current_positions_from_observation else 0
+    health = _Health(healthy, healthy_reward, terminate_when_unhealthy)
+    return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight, health, 10.0)
+
+
+def _walker2d(
+    model: Simulated,
+    *,
+    forward_reward_weight: float = 1.0,
+    ctrl_cost_weight: float = 1e-3,
+    healthy_reward: float = 1.0,
+    terminate_when_unhealthy: bool = True,
+    healthy_z_range: Range = (0.8, 2.0),
+    healthy_angle_range: Range = (-1.0, 1.0),
+    reset_noise_scale: float = 5e-3,
+    exclude_current_positions_from_observation: bool = True,
+) -> Parts:
+    def healthy(qpos: Any, qvel: Any) -> Any:
+        return _inside(qpos[1], healthy_z_range) & _inside(qpos[2], healthy_angle_range)
+
+    start = _noisy(model, reset_noise_scale)
+    hidden = 1 if exclude_current_positions_from_observation else 0
+    health = _Health(healthy, healthy_reward, terminate_when_unhealthy)
+    return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight, health, 10.0)
+
+
+def _reacher(model: Simulated, *, reward_dist_weight: float = 1.0, reward_control_weight: float = 1.0) -> Parts:
+    fingertip, target = model.body("fingertip"), model.body("target")
+
+    def start(key: Any) -> tuple[Any, Any]:
+        """The goal is anywhere in a disc of radius 0.2, where Gymnasium draws in a square until it is in the disc."""
+        noise_Q, noise_V = 2.0 * _uniforms(key, 0, 4) - 1.0, 2.0 * _uniforms(key, 4, 2) - 1.0
+        share, turn = _uniforms(key, 6, 2)
+        angle = 2.0 * jnp.pi * turn
+        goal = 0.2 * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        qpos = jnp.concatenate([model.mx.qpos0[:2] + 0.1 * noise_Q[:2], goal])
+        return qpos, jnp.concatenate([0.005 * noise_V, jnp.zeros(2)])
+
+    def look(data: Any, stepped: bool) -> Any:
+        return data.xpos[fingertip] - data.xpos[target]
+
+    def observe(state: GymState) -> Any:
+        qpos, qvel = state.physics[:2]
+        return jnp.concatenate([jnp.cos(qpos[:2]), jnp.sin(qpos[:2]), qpos[2:], qvel[:2], state.seen[:2]])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        distance = jnp.sqrt(jnp.sum(after.seen**2))
+        reward = -reward_dist_weight * distance - reward_control_weight * jnp.sum(action**2)
+        return reward, jnp.bool_(False)
+
+    return Parts(start, observe, outcome, look)
+
+
+def _inverted_pendulum(model: Simulated, *, reset_noise_scale: float = 0.01) -> Parts:
+    def observe(state: GymState) -> Any:
+        return jnp.concatenate(state.physics[:2])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        observation = observe(after)
+        done = ~jnp.isfinite(observation).all() | (jnp.abs(observation[1]) > 0.2)
+        return jnp.where(done, 0.0, 1.0), done
+
+    return Parts(_noisy(model, reset_noise_scale), observe, outcome)
+
+
+def _inverted_double_pendulum(
+    model: Simulated, *, healthy_reward: float = 10.0, reset_noise_scale: float = 0.1
+) -> Parts:
+    def look(data: Any, stepped: bool) -> Any:
+        """Place of the tip in the plane, and the force of the constraint on the cart."""
+        return jnp.stack([data.site_xpos[0, 0], data.site_xpos[0, 2], data.qfrc_constraint[0]])
+
+    def observe(state: GymState) -> Any:
+        qpos, qvel = state.physics[:2]
+        limited = jnp.clip(jnp.concatenate([qvel, state.seen[2:]]), -10.0, 10.0)
+        return jnp.concatenate([qpos[:1], jnp.sin(qpos[1:]), jnp.cos(qpos[1:]), limited])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        (x, y, _), (_, first, second) = after.seen, after.physics.qvel
+        done = y <= 1.0
+        penalties = 0.01 * x**2 + (y - 2.0) ** 2 + 1e-3 * first**2 + 5e-3 * second**2
+        return jnp.where(done, 0.0, healthy_reward) - penalties, done
+
+    return Parts(_noisy(model, reset_noise_scale, normal=True), observe, outcome, look)
+
+
+class _Health(NamedTuple):
+    """What a robot that stands is worth."""
+
+    of: Callable[[Any, Any], Any]
+    """Function (qpos, qvel) -> whether it stands."""
+    reward: float
+    ends: bool
+    """Whether an episode ends when it does not."""
+
+
+def _runner(
+    model: Simulated,
+    start: Callable[[Any], tuple[Any, Any]],
+    hidden: int,
+    forward_reward_weight: float,
+    ctrl_cost_weight: float,
+    health: _Health | None = None,
+    fastest: float = float("inf"),
+) -> Parts:
+    """A robot that is rewarded for running along x, the first of its positions.
+
+    Args:
+        hidden: leading positions that are not observed.
+        fastest: bound of the observed velocities.
+    """
+
+    def observe(state: GymState) -> Any:
+        qpos, qvel = state.physics[:2]
+        return jnp.concatenate([qpos[hidden:], jnp.clip(qvel, -fastest, fastest)])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        velocity = (after.physics.qpos[0] - before.physics.qpos[0]) / model.step_s
+        reward = forward_reward_weight * velocity - ctrl_cost_weight * jnp.sum(action**2)
+        if health is None:
+            return reward, jnp.bool_(False)
+        healthy = health.of(*after.physics[:2])
+        return reward + healthy * health.reward, ~healthy & health.ends
+
+    return Parts(start, observe, outcome)
+
+
+def _noisy(model: Simulated, scale: float, *, normal: bool = False) -> Callable[[Any], tuple[Any, Any]]:
+    """Resets near the model's own state: uniform noise on positions, uniform or normal noise on velocities."""
+    nq, nv = model.c.nq, model.c.nv
+
+    def start(key: Any) -> tuple[Any, Any]:
+        if normal:
+            noise_V = normal_integers(jnp, key, _counters(nq, nv)).astype(jnp.float32) / NORMAL_STD
+        else:
+            noise_V = 2.0 * _uniforms(key, nq, nv) - 1.0
+        return model.mx.qpos0 + scale * (2.0 * _uniforms(key, 0, nq) - 1.0), scale * noise_V
+
+    return start
+
+
+def _counters(first: int, count: int) -> Any:
+    return jnp.arange(first, first + count, dtype=jnp.uint32)
+
+
+def _uniforms(key: Any, first: int, count: int) -> Any:
+    """Uniform variates in [0, 1) at coordinates from `first` on."""
+    return uniforms(key, _counters(first, count))
+
+
+def _inside(x: Any, bounds: Range) -> Any:
+    low, high = bounds
+    return (low < x) & (x < high)
+
+
+TASKS = {
+    "Ant-v5": GymTask("ant.xml", 5, _ant),
+    "HalfCheetah-v5": GymTask("half_cheetah.xml", 5, _half_cheetah),
+    "Hopper-v5": GymTask("hopper.xml", 4, _hopper),
+    "Walker2d-v5": GymTask("walker2d_v5.xml", 4, _walker2d),
+    "Swimmer-v5": GymTask("swimmer.xml", 4, _swimmer),
+    "Reacher-v5": GymTask("reacher.xml", 2, _reacher, 50),
+    "InvertedPendulum-v5": GymTask("inverted_pendulum.xml", 2, _inverted_pendulum),
+    "InvertedDoublePendulum-v5": GymTask("inverted_double_pendulum.xml", 5, _inverted_double_pendulum),
+}
+"""Environments by their IDs in Gymnasium."""
+_PGS = "MJX lacks PGS, the solver of its model, and other solvers find other forces"
+REFUSED = {
+    "Humanoid-v5": _PGS,
+    "HumanoidStandup-v5": _PGS,
+    "Pusher-v5": "MJX finds contacts of capsules with a cylinder otherwise than C MuJoCo",
+}
+"""Environments of Gymnasium's MuJoCo that are none here -> the reason."""
