@@ -11,7 +11,7 @@ import pytest
 
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
-from es_service.protocol.messages import EvaluationChunk, PolicySpec, with_options
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
@@ -249,6 +249,9 @@ def test_episodes_of_an_ant_of_mjx_are_those_of_xla():
     shape = PolicySpec((27, 8))
     given = {"environment": "brax:ant", "environment_options": options, "policy": shape, "episode_steps": 10}
     point = centre(random_parameters(size=shape.parameters), observation_size=27)
-    ours, theirs = (chunk_runner(spec(rollout=name, **given))(point, EvaluationChunk(1, 0)) for name in ("simd", "xla"))
+    runners = (chunk_runner(spec(rollout=name, **given)) for name in ("simd", "xla"))
+    ours, theirs = (run(point, EvaluationChunk(1, 0)) for run in runners)
+    assert isinstance(ours, EpisodesResult)
+    assert isinstance(theirs, EpisodesResult)
     np.testing.assert_allclose(ours.returns, theirs.returns, rtol=1e-3)
     np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=1e-3)  # paths separate after contacts
