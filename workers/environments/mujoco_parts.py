@@ -3,7 +3,7 @@
 A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
 implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
 makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
-own and is used as it is.
+own and is used as it is, but for the loop of RK4 and the contacts of capsules with planes.
 
 Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
 (`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
@@ -12,6 +12,7 @@ be what simd cannot compile.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import importlib
 from collections.abc import Callable, Iterator
@@ -27,7 +28,7 @@ from workers.environments.brax_parts import quietly
 mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains
 with quietly():
     from mujoco import mjx
-    from mujoco.mjx._src import collision_driver, support, types
+    from mujoco.mjx._src import collision_driver, collision_primitive, support, types
     from mujoco.mjx._src import forward as forward_of_mjx
 
 MjModel = Any
@@ -122,9 +123,10 @@ def step_and_look(
     def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
         return integrate(model, _data(empty, before[0], ctrl), look), None
 
-    first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
-    begun = state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
-    return substep(begun, None)[0] if substeps == 1 else jax.lax.scan(substep, begun, None, length=substeps)[0]
+    with _contacts_as_c():
+        first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
+        begun = state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
+        return substep(begun, None)[0] if substeps == 1 else jax.lax.scan(substep, begun, None, length=substeps)[0]
 
 
 def _mjx_step(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
@@ -166,7 +168,39 @@ def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], An
 
 def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
     """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors."""
-    return mjx.forward(model, _data(mjx.make_data(model), state, ctrl))
+    with _contacts_as_c():
+        return mjx.forward(model, _data(mjx.make_data(model), state, ctrl))
+
+
+@collision_primitive.collider(ncon=2)
+def _plane_capsule(plane: Any, capsule: Any) -> tuple[Any, Any, Any]:
+    """Contacts of a plane with both ends of a capsule: distances, places and frames.
+
+    The first tangent of the frame, on which the pyramid of friction depends, is along the capsule, as in C MuJoCo.
+    MJX has another one for capsules that stand steeper than 60 degrees.
+    """
+    normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
+    flat = axis - normal * jnp.dot(normal, axis)
+    length = jnp.sqrt(jnp.sum(flat**2))
+    tangent = jnp.where(length > mujoco.mjMINVAL, flat / jnp.maximum(length, mujoco.mjMINVAL), jnp.eye(3)[0])
+    frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
+    ends = jnp.stack([capsule.pos + axis * capsule.size[1], capsule.pos - axis * capsule.size[1]])
+    distances = (ends - plane.pos) @ normal - capsule.size[0]
+    places = ends - normal * (capsule.size[0] + 0.5 * distances)[:, None]
+    return distances, places, jnp.stack([frame, frame])
+
+
+@contextlib.contextmanager
+def _contacts_as_c() -> Iterator[None]:
+    """Context manager in which MJX is traced with the contacts of C MuJoCo."""
+    functions, pair = collision_driver._COLLISION_FUNC, (types.GeomType.PLANE, types.GeomType.CAPSULE)
+    with quietly():
+        before = functions[pair]
+        functions[pair] = _plane_capsule
+        try:
+            yield
+        finally:
+            functions[pair] = before
 
 
 def contact_forces(model: mjx.Model, data: Any) -> Any:
