@@ -27,8 +27,6 @@ KEYS = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(256))
 TIMES = 8.0
 """Errors may be so many times as great as what one ulp of a state makes in Gymnasium: a step rounds thousands of
 times."""
-UNITS = {"Ant-v5": 2e-4}
-"""Errors that are allowed besides, if not 1e-6: MJX's RK4 turns a free body otherwise than C MuJoCo's."""
 LONGEST = 60
 """Most steps with random actions after which a state is compared."""
 NOT_OURS = {"self", "xml_file", "default_camera_config", "frame_skip", "kwargs"}
@@ -97,7 +95,7 @@ def compare(name: str, count: int) -> None:
         error, *ulps = (relative_error(getattr(of, what).reshape(count, -1), right) for of in (found, *moved))
         ulp = np.maximum.reduce(ulps)
         print(what, *(f"{np.quantile(of, share):.1e}" for of in (error, ulp) for share in (0.5, 0.99, 1.0)))
-        assert np.quantile(error, 0.99) <= TIMES * (ulp.max() + UNITS.get(name, 1e-6)), what
+        assert np.quantile(error, 0.99) <= TIMES * (ulp.max() + 1e-6), what
     at_the_edge = np.any([of.done != truth.done for of in moved], axis=0)
     np.testing.assert_array_equal(found.done[~at_the_edge], truth.done[~at_the_edge])
 

@@ -3,7 +3,7 @@
 A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
 implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
 makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
-own and is used as it is, but for the loop of RK4 and the contacts of capsules with planes.
+own and is used as it is, but for RK4 and the contacts of capsules with planes.
 
 Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
 (`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
@@ -141,7 +141,8 @@ STAGES = np.array([[0.0, 0.5, 0.5, 1.0], np.array([1, 2, 2, 1]) / 6]).T
 def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
     """A substep of RK4, and what is seen in its fourth stage.
 
-    It is MJX's with the stages in a loop: four copies of the physics take four times as long to compile.
+    It is MJX's with the stages in a loop, since four copies of the physics take four times as long to compile, and with
+    the rates of rotations of C MuJoCo.
     """
     advanced = forward_of_mjx._advance
 
@@ -154,7 +155,9 @@ def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], An
         rates, sums, _ = carry
         at = moved(rates, numbers[0])
         found = mjx.forward(model, at.replace(qacc_warmstart=data.qacc_warmstart))
-        rates = found.qvel, found.qacc, found.act_dot
+        share_of_step = numbers[0] * model.opt.timestep
+        turned = _turning(model, share_of_step * rates[0], found.qvel)
+        rates = turned, found.qacc, found.act_dot
         sums = jax.tree.map(lambda total, rate: total + numbers[1] * rate, sums, rates)
         return (rates, sums, (found.qacc, look(found))), None
 
@@ -164,6 +167,26 @@ def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], An
     stages = jnp.asarray(STAGES, data.qvel.dtype)
     (_, rates, (qacc, seen)), _ = jax.lax.scan(stage, (still, still, unseen), stages)
     return _state(moved(rates, 1.0).replace(qacc_warmstart=qacc)), seen
+
+
+def _turning(model: mjx.Model, moved: Any, qvel: Any) -> Any:
+    """Rates of the rotation vectors of balls and free bodies that turn with `qvel`, and `qvel` of all else.
+
+    Args:
+        moved: [nv] how far a state is from the one before the step; of rotations the vector.
+    """
+    for joint in range(model.njnt):
+        kind, first = model.jnt_type[joint], model.jnt_dofadr[joint]
+        if kind in (types.JointType.FREE, types.JointType.BALL):
+            at = slice(first + 3, first + 6) if kind == types.JointType.FREE else slice(first, first + 3)
+            turn, speed = moved[at], qvel[at]
+            angle = jnp.sqrt(jnp.sum(turn**2))
+            half = 0.5 * jnp.maximum(angle, 0.3)
+            small = 1 / 12 + angle**2 / 720 + angle**4 / 30240
+            factor = jnp.where(angle > 0.3, (1.0 - half / jnp.tan(half)) / (4.0 * half**2), small)
+            across = jnp.cross(turn, speed)
+            qvel = qvel.at[at].set(speed + 0.5 * across + factor * jnp.cross(turn, across))
+    return qvel
 
 
 def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
