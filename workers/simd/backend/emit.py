@@ -16,8 +16,8 @@ from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import Region, schedule
 from workers.simd.graph.unsupported import UnsupportedError, refusing
 
-MOST_SLOTS = 8192
-"""Most vectors in the memory of a block, half a MiB; this memory is on the stack."""
+MOST_SLOTS = 16384
+"""Most vectors in the memory of a block, one MiB; this memory is on the stack."""
 MOST_LIVE = 16384
 """Most values that may be needed at the same time, of which the stack holds what registers cannot: one MiB."""
 
