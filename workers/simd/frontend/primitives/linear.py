@@ -173,10 +173,10 @@ def _eliminate(
     operations, order = 0, []
     while near:
         order.append(following(near))
-        around = near.pop(order[-1])
-        operations += len(around) * (len(around) + 7) // 2
-        for i in around:
-            near[i] = (near[i] | around) - {i, order[-1]}
+        neighbours = near.pop(order[-1])
+        operations += len(neighbours) * (len(neighbours) + 7) // 2
+        for i in neighbours:
+            near[i] = (near[i] | neighbours) - {i, order[-1]}
     return operations, order
 
 
