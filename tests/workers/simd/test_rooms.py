@@ -24,8 +24,8 @@ BELOW = {
 }
 """Folder -> those it may import from, besides itself."""
 NEEDS = {"graph": {"numpy"}, "backend": {"numpy", "llvmlite"}, "frontend": {"numpy", "jax", "es_service"}}
-"""Folder -> what it may import besides the compiler; episodes may import what they like. Of es_service, workers import the
-protocol alone, by another test."""
+"""Folder -> what it may import besides the compiler; episodes may import what they like. Of es_service, workers import
+the protocol alone, by another test."""
 
 
 def module_of(path: Path) -> str:
