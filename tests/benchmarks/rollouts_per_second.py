@@ -183,7 +183,7 @@ def compare_looking(task: str, hidden: list[int] | None, rollout: str, seconds: 
     """A row: for training and evaluation, the cost of looking in percent, the median of the rounds and the quartiles.
 
     Each round makes both workers anew, since where their code and memory lie changes their speed by some percent. Calls
-    are by turns, in seconds of this thread.
+    are by turns, in seconds of this process, since xla computes in threads of its own.
     """
     config = config_of(task, hidden)
     spec = replace(worker_spec(config, task_of(config)), rollout=rollout)
@@ -201,9 +201,9 @@ def compare_looking(task: str, hidden: list[int] | None, rollout: str, seconds: 
             while len(durations[True]) < 3 or time.perf_counter() < end:
                 for looks, block in blocks.items():
                     with block():
-                        start = time.thread_time()
+                        start = time.process_time()
                         runs[looks](work)
-                        durations[looks].append(time.thread_time() - start)
+                        durations[looks].append(time.process_time() - start)
             looked, unlooked = (statistics.median(durations[looks]) for looks in blocks)
             ratios[kind].append(looked / unlooked)
             unlooked_s[kind].append(unlooked)
