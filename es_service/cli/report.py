@@ -48,6 +48,18 @@ def report(
         Path | None,
         typer.Option("--figures", parser=given_path, metavar="DIR", help="Also write each figure as SVG and PNG."),
     ] = None,
+    paired: Annotated[
+        bool, typer.Option("--paired", help="Test groups of compared runs by pairs of equal seeds.")
+    ] = False,
+    statistics: Annotated[
+        Path | None,
+        typer.Option(
+            "--statistics",
+            parser=given_path,
+            metavar="FILE",
+            help="Also write the statistics between groups, as FILE.json, .csv or .tex.",
+        ),
+    ] = None,
 ) -> None:
     """Write a page about a run: its curves, its map, its policies; or one that compares several runs, or a sweep."""
     from es_service.report.write import REPORT, write_report
@@ -57,10 +69,10 @@ def report(
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")
         if out is None and len(folders) > 1:
             raise ConfigError("a comparison of runs belongs to none of their folders; add --out FILE")
-        _compare(folders, out or folders[0] / REPORT, group_by or (), threshold, figures)
+        _compare(folders, out or folders[0] / REPORT, group_by or (), threshold, figures, paired, statistics)
         return
-    if group_by or threshold is not None:
-        print_note("note: --group-by and --threshold have no effect with one run")
+    if group_by or threshold is not None or paired or statistics:
+        print_note("note: --group-by, --threshold, --paired and --statistics have no effect with one run")
     [folder] = folders
     wanted = list(dict.fromkeys(replay or ["best"]))
     if "none" in wanted and len(wanted) > 1:
@@ -81,7 +93,13 @@ def report(
 
 
 def _compare(
-    folders: Sequence[Path], out: Path, group_by: Sequence[str], threshold: float | None, figures: Path | None
+    folders: Sequence[Path],
+    out: Path,
+    group_by: Sequence[str],
+    threshold: float | None,
+    figures: Path | None,
+    paired: bool,
+    statistics: Path | None,
 ) -> None:
     """Write the comparison of all runs with a finished generation; exit with code 1 if a run cannot be read."""
     from es_service.report.compare import swept_keys
@@ -99,7 +117,7 @@ def _compare(
     runs = list(comparable())
     if len(folders) == 1 and not group_by:
         group_by = swept_keys(runs)
-    for file in write_comparison(runs, out, group_by, threshold, figures):
+    for file in write_comparison(runs, out, group_by, threshold, figures, paired=paired, statistics=statistics):
         print(file)
     if problems:
         raise typer.Exit(1)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from es_service.errors import NotInRunError, counted
-from es_service.report import compare, maps
+from es_service.report import between, compare, maps
 from es_service.report.bootstrap import WHOLE_RANGE, coverage
 from es_service.report.colours import value_range
 from es_service.report.compare import Group, Quartiles, Summary
@@ -26,23 +26,26 @@ HEADS = {**compare.LABELS, "env_steps": "million steps", "wall_clock_s": "second
 """History column of the final table -> its heading."""
 
 
-def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None) -> str:
+def comparison_page(
+    runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None, *, paired: bool = False
+) -> str:
     """HTML of the comparison of runs; arguments and errors as of `comparison_sections`."""
-    title, sections, scripts = comparison_sections(runs, keys, threshold)
-    return document(title, list(sections.values()), scripts)
+    title, sections, scripts = comparison_sections(runs, keys, threshold, paired=paired)
+    return document(title, [html for html in sections.values() if html], scripts)
 
 
 def comparison_sections(
-    runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None
+    runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None, *, paired: bool = False
 ) -> tuple[str, dict[str, Markup], dict[str, Any]]:
     """Title, sections by id and data of the script of a page that compares runs; see `compare.grouped` for the keys.
 
     Args:
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
+        paired: whether tests compare runs with equal seeds; see `between.compared`.
 
     Raises:
-        ConfigError: the runs cannot be compared. NotInRunError: a run has no finished generation, or there is no
-            run.
+        ConfigError: the runs cannot be compared, or not paired. NotInRunError: a run has no finished generation, or
+            there is no run.
     """
     if not runs:
         raise NotInRunError("there is no run with a finished generation to compare")
@@ -75,6 +78,7 @@ def comparison_sections(
             id_="curves",
         ),
         "final": section("Final values", _final(groups, threshold), id_="final"),
+        "between": between.section_of(groups, threshold, paired) or Markup(""),
         "maps": joined(_maps(groups)),
         "runs": section("Runs", _runs(groups), id_="runs"),
     }  # fmt: skip

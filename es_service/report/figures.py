@@ -57,6 +57,7 @@ def write_figures(
         drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
     else:
         drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
+        drawings["profile"] = lambda figure: plots.profile(list(runs), figure.subplots(), group_by=keys)
         if mapped:
             colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
             for index, group in enumerate(compare.grouped(runs, keys)):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.system import given_path
-from es_service.report import compare
+from es_service.report import between, compare, statistics
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
 from es_service.report.detours import detours
@@ -176,7 +176,7 @@ def curves(
     groups = compare.grouped(all_data, group_by)
     x_K = compare.places(groups, against)
     for index, group in enumerate(groups):
-        style = {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
+        style = _style(index)
         if len(all_data) == 1:
             _curve(axes, group.runs[0].history[against], group.runs[0].history[column], style)
             continue
@@ -187,8 +187,44 @@ def curves(
     axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))
     if against == "env_steps":
         axes.xaxis.set_major_formatter(importlib.import_module("matplotlib.ticker").EngFormatter(sep=""))
+    _frame(axes, legend=len(groups) > 1)
+
+
+def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: Sequence[str] = ()) -> None:
+    """Draw performance profiles: the share of the runs of a group that are at least as good as each value of a measure.
+
+    A shaded region is the bootstrap interval at each value by itself; see `statistics.profile`.
+
+    Args:
+        measure: name of a measure of `between.values`, such as `certified`, `best_fitness` or `coverage`.
+        group_by: config keys that group the runs; see `compare.grouped`.
+
+    Raises ConfigError for a measure that a run lacks, and for runs of different tasks.
+    """
+    groups = compare.grouped([_data(source) for source in runs], group_by)
+    title, sign, values = between.values(groups, measure)
+    place_K = np.unique(np.concatenate(values))
+    place_K = place_K[np.isfinite(place_K)]
+    for index, (group, values_R) in enumerate(zip(groups, values, strict=True)):
+        style = _style(index)
+        signed, sign_K = [sign * values_R], sign * place_K
+        steps: dict[str, Any] = {"step": "pre" if sign > 0 else "post"}
+        axes.step(place_K, statistics.profile(signed, sign_K), where=steps["step"], label=group.name, **style)
+        if (ends_2_K := statistics.profile_interval(signed, sign_K)) is not None:
+            axes.fill_between(place_K, *ends_2_K, color=style["color"], alpha=0.18, linewidth=0, **steps)
+    axes.set(ylim=(-0.02, 1.02), ylabel=f"share of runs at {'least' if sign > 0 else 'most'} here")
+    axes.set_xlabel(title, parse_math=False)
+    _frame(axes, legend=True)
+
+
+def _style(index: int) -> dict[str, Any]:
+    """How the line of a group is drawn."""
+    return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
+
+
+def _frame(axes: Axes, *, legend: bool) -> None:
     axes.spines[["top", "right"]].set_visible(False)
-    if len(groups) > 1:
+    if legend:
         for text in axes.legend(frameon=False).get_texts():
             text.set_parse_math(False)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.protocol.system import given_path
+from es_service.report import between, compare
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
 from es_service.report.figures import empty_figure, write_figures
@@ -86,6 +87,9 @@ def write_comparison(
     group_by: Sequence[str] = (),
     threshold: float | None = None,
     figures: AnyPath | None = None,
+    *,
+    paired: bool = False,
+    statistics: AnyPath | None = None,
 ) -> list[Path]:
     """Write the page that compares runs of one task and return the files written, the page first.
 
@@ -94,17 +98,30 @@ def write_comparison(
         group_by: config keys that group the runs; see `compare.grouped`.
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
         figures: folder to write figures into; None: none are written.
+        paired: whether tests compare runs with equal seeds; otherwise all runs are independent.
+        statistics: file to write the statistics between groups into, by its name as JSON, CSV or LaTeX (.json, .csv,
+            .tex); None: none is written.
 
     Raises:
-        ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
-            finished generation. StoreError: a run cannot be read, or a file cannot be written.
+        ConfigError: the runs cannot be compared, grouped or paired, the file of statistics has another ending, or
+            figures are wanted without matplotlib. NotInRunError: a run has no finished generation. StoreError: a run
+            cannot be read, or a file cannot be written.
     """
     if figures is not None:
         empty_figure()  # a missing matplotlib is reported before anything is read
+    kind = "" if statistics is None else between.checked_kind(given_path(statistics))
     read = (run if isinstance(run, RunData) else read_compared(given_path(run)) for run in folders)
     different = list({run.folder.resolve(): run for run in read}.values())  # a run that is given twice counts once
-    page = write_page(comparison_page(different, group_by, threshold), given_path(out))
-    return [page, *(write_figures(different, given_path(figures), group_by, threshold) if figures is not None else [])]
+    written = [write_page(comparison_page(different, group_by, threshold, paired=paired), given_path(out))]
+    if statistics is not None:
+        groups = compare.grouped(different, group_by)
+        limit = compare.common_threshold(different) if threshold is None else threshold
+        text = between.text_of(between.compared(groups, limit, paired=paired), kind)
+        written.append(write_page(text, given_path(statistics)))
+    return [
+        *written,
+        *(write_figures(different, given_path(figures), group_by, threshold) if figures is not None else []),
+    ]
 
 
 def read_compared(folder: Path) -> RunData:

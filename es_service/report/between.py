@@ -1,0 +1,350 @@
+"""Is one group of runs better than another? Averages, probabilities and tests for what the runs have found.
+
+A measure is a number of each run, such as its certified value or its steps to a target. All runs of all groups have
+it, or it is left out. Measures are compared between each two groups, and the tests of one measure are corrected
+together.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import ConfigError
+from es_service.report import statistics
+from es_service.report.bootstrap import LEVEL
+from es_service.report.compare import LABELS, Group
+from es_service.report.data import RunData
+from es_service.report.facts import number
+from es_service.report.markup import Markup, table, tag
+from es_service.report.page import section
+from es_service.report.statistics import Difference
+from es_service.runs.certified import measure_of
+
+FORMATS = (".json", ".csv", ".tex")
+"""Kinds of files of statistics."""
+COST = "cost_to_target"
+Ends = tuple[float, float]
+
+
+class Average(NamedTuple):
+    """A measure of one group."""
+
+    group: str
+    runs: int
+    median: float
+    median_interval: Ends | None
+    iqm: float | None
+    """Interquartile mean; None if a run never reached a target."""
+    iqm_interval: Ends | None
+
+
+class Pair(NamedTuple):
+    """A measure of two groups."""
+
+    first: str
+    second: str
+    difference: Difference
+    """The first group against the second, so that above 0.5 the first is better."""
+    p_corrected: float
+    """By Holm's correction for all pairs of the measure."""
+
+
+class Compared(NamedTuple):
+    """A measure of all groups."""
+
+    name: str
+    title: str
+    lower_is_better: bool
+    averages: tuple[Average, ...]
+    pairs: tuple[Pair, ...]
+
+    @property
+    def smallest_p(self) -> float:
+        """The smallest corrected p that all pairs allow, with as many runs as the groups have."""
+        return min(1.0, len(self.pairs) * min(pair.difference.smallest_p for pair in self.pairs))
+
+
+def compared(groups: Sequence[Group], threshold: float | None = None, *, paired: bool = False) -> list[Compared]:
+    """All measures that all runs have, between each two groups.
+
+    Args:
+        threshold: fitness of which the cost to reach it is compared; None: it is not.
+        paired: whether runs with equal seeds belong together; otherwise all are independent.
+
+    Raises:
+        ConfigError: groups are paired that have not the same seeds, once each.
+    """
+    if paired:
+        _require_pairs(groups)
+    found = []
+    for name, (title, lower_is_better, value) in _measures(groups, threshold).items():
+        values_R = _values(groups, value)
+        if any(np.isnan(of_group).any() for of_group in values_R):
+            continue
+        sign = -1.0 if lower_is_better else 1.0
+        averages = tuple(_average(group, of_group) for group, of_group in zip(groups, values_R, strict=True))
+        places = list(combinations(range(len(groups)), 2))
+        differences = [
+            statistics.difference([sign * values_R[i]], [sign * values_R[j]], paired=paired) for i, j in places
+        ]
+        corrected = statistics.holm([difference.p for difference in differences])
+        pairs = tuple(
+            Pair(groups[i].name, groups[j].name, difference._replace(shift=sign * difference.shift + 0.0), p)
+            for (i, j), difference, p in zip(places, differences, corrected, strict=True)
+        )
+        found.append(Compared(name, title, lower_is_better, averages, pairs))
+    return found
+
+
+def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[NDArray[np.float64]]]:
+    """A measure of each run: (title, -1 if less is better or else 1, values [R] of each group in the order of seeds).
+
+    Raises ConfigError if there is no such measure, or if a run lacks it.
+    """
+    measures = _measures(groups, None)
+    title, lower_is_better, value = measures.get(name, ("", False, lambda _: np.nan))
+    found = _values(groups, value)
+    if any(np.isnan(of_group).any() for of_group in found):
+        raise ConfigError(f"{name} is no measure that all runs have", value=name, allowed=", ".join(measures))
+    return title, -1.0 if lower_is_better else 1.0, found
+
+
+def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[NDArray[np.float64]]:
+    ordered = [sorted(group.runs, key=lambda run: run.constants["seed"]) for group in groups]
+    return [np.array([value(run) for run in runs], float) for runs in ordered]
+
+
+def _measures(
+    groups: Sequence[Group], threshold: float | None
+) -> dict[str, tuple[str, bool, Callable[[RunData], float]]]:
+    """Name -> (title, whether less is better, the number of a run; NaN if it has none)."""
+    measure = measure_of(groups[0].runs[0].constants["task.fitness"])
+
+    def certified(column: str, share: bool = False) -> Callable[[RunData], float]:
+        def value(run: RunData) -> float:
+            row = {} if run.certified is None else run.certified.row()
+            found = row.get(column)
+            return np.nan if found is None else float(found) / (row["episodes"] if share else 1)
+
+        return value
+
+    def cost(run: RunData) -> float:
+        assert threshold is not None
+        reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
+        return float(run.history["env_steps"][reached[0]]) if reached.size else np.inf
+
+    found: dict[str, tuple[str, bool, Callable[[RunData], float]]] = {
+        "certified": (f"certified {measure.replace('_', ' ')}", False, certified(f"{measure}_mean")),
+        "certified_success": ("certified successes, as a share", False, certified("successes", share=True)),
+        **{column: (title, column == "goal_distance", _last(column)) for column, title in LABELS.items()},
+    }
+    if threshold is not None:
+        found[COST] = (f"environment steps until a best fitness of {number(threshold)}", True, cost)
+    return found
+
+
+def _last(column: str) -> Callable[[RunData], float]:
+    return lambda run: run.last(column)
+
+
+def _average(group: Group, values_R: NDArray[np.float64]) -> Average:
+    independent = group.seeds == len(group.runs)
+    is_finite = bool(np.isfinite(values_R).all())
+
+    def known(measure: statistics.Measure) -> Ends | None:
+        return statistics.interval(measure, [values_R]) if independent else None
+
+    return Average(
+        group.name,
+        len(values_R),
+        float(statistics.median([values_R])),
+        known(statistics.median),
+        float(statistics.iqm([values_R])) if is_finite else None,
+        known(statistics.iqm) if is_finite else None,
+    )
+
+
+def _require_pairs(groups: Sequence[Group]) -> None:
+    seeds = {group.name: sorted(run.constants["seed"] for run in group.runs) for group in groups}
+    first, *others = seeds.items()
+    for name, of_group in [first, *others]:
+        if of_group != first[1] or len(set(of_group)) < len(of_group):
+            raise ConfigError(
+                f"runs cannot be paired by their seeds: {first[0]} has the seeds {first[1]}, {name} has {of_group}; "
+                "give each group one run with each seed, or leave pairs out",
+                field="paired",
+                value=seeds,
+            )
+
+
+def section_of(groups: Sequence[Group], threshold: float | None, paired: bool = False) -> Markup | None:
+    """The part of a page that answers whether groups differ; None if there are no two groups of two runs or more."""
+    if len(groups) < 2 or min(len(group.runs) for group in groups) < 2:
+        return None
+    parts: list[Markup] = []
+    for measure in compared(groups, threshold, paired=paired):
+        averages = [
+            (
+                average.group,
+                f"{average.runs}",
+                _with_ends(average.median, average.median_interval),
+                "-" if average.iqm is None else _with_ends(average.iqm, average.iqm_interval),
+            )
+            for average in measure.averages
+        ]
+        pairs = [
+            (
+                f"{pair.first} over {pair.second}",
+                _with_ends(pair.difference.improvement, pair.difference.interval),
+                "-" if np.isnan(pair.difference.shift) else number(pair.difference.shift),
+                p_text(pair.difference.p),
+                p_text(pair.p_corrected),
+            )
+            for pair in measure.pairs
+        ]
+        parts += [
+            tag("h3", f"{measure.title}{' (less is better)' if measure.lower_is_better else ''}"),
+            tag(
+                "div",
+                table(averages, ("group", "runs", "median", "interquartile mean"), "numbers"),
+                table(pairs, ("pair", "probability of improvement", "difference", "p", "p, corrected"), "numbers"),
+                class_="side",
+            ),
+            tag("p", _smallest(measure), class_="note"),
+        ]
+    return section("Between groups", *parts, tag("p", _explained(groups, paired), class_="note"), id_="between")
+
+
+def p_text(p: float) -> str:
+    """A probability of a test, with two digits."""
+    return f"{p:.2g}" if p >= 0.0001 else "< 0.0001"
+
+
+def _with_ends(value: float, ends: Ends | None) -> Markup:
+    shown = "" if ends is None or np.isnan(ends[0]) or ends[0] == ends[1] else f"{number(ends[0])} to {number(ends[1])}"
+    return tag("div", number(value), tag("div", shown, class_="note") if shown else None)
+
+
+def _smallest(measure: Compared) -> str:
+    words = "The smallest corrected p that so many runs allow is"
+    return f"{words} {p_text(measure.smallest_p)}."
+
+
+def _explained(groups: Sequence[Group], paired: bool) -> str:
+    """What the numbers mean, and how far they can be trusted."""
+    test = "Wilcoxon's signed-rank test of runs with equal seeds" if paired else "the test of Mann and Whitney"
+    said = [
+        f"Ranges are {100 * LEVEL:.0f} % intervals by the percentile bootstrap over runs.",
+        "In simulations, those of 3 runs hold the true value three times in four, and those of 5 nine times in ten.",
+        "The interquartile mean leaves out a quarter of the runs at each end.",
+        "The probability of improvement is that of a run of the first group being better than one of the second.",
+        "The difference is the median of the differences between their runs.",
+        f"p is two-sided, from {test}, and corrected by Holm's method for all pairs of groups.",
+    ]
+    if not paired:
+        said.append("Runs count as independent, also where groups have the same seeds.")
+    if len(groups) > 2:
+        said.append(
+            "Whoever calls the first of several groups the best has chosen it by these values, which are then too high "
+            "on the average; new seeds tell its value."
+        )
+    if repeated := [group.name for group in groups if group.seeds < len(group.runs)]:
+        said.append(
+            f"Several runs have the same seed in {', '.join(repeated)}: they are not independent, and p is wrong."
+        )
+    return " ".join(said)
+
+
+def as_data(measures: Sequence[Compared]) -> list[dict[str, Any]]:
+    """Measures as values of JSON; an infinite or missing number is None."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, float):
+            return value if np.isfinite(value) else None
+        if hasattr(value, "_asdict"):
+            return {key: plain(part) for key, part in value._asdict().items()}
+        return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
+    return [{**plain(measure), "smallest_p": measure.smallest_p, "level": LEVEL} for measure in measures]
+
+
+def text_of(measures: Sequence[Compared], kind: str) -> str:
+    """Measures as a file of a kind of FORMATS."""
+    if kind == ".json":
+        return json.dumps(as_data(measures), indent=1, allow_nan=False) + "\n"
+    return _csv(measures) if kind == ".csv" else _latex(measures)
+
+
+def _csv(measures: Sequence[Compared]) -> str:
+    """A row for each group, whose second group is empty, and one for each pair."""
+    file, rows = io.StringIO(), []
+    for measure in as_data(measures):
+        name = {"measure": measure["name"]}
+        rows += [{**name, "first": average.pop("group"), **_flat(average)} for average in measure["averages"]]
+        rows += [{**name, **_flat({**pair.pop("difference"), **pair})} for pair in measure["pairs"]]
+    names = list(dict.fromkeys(name for row in [{"measure": 0, "first": 0, "second": 0}, *rows] for name in row))
+    writer = csv.DictWriter(file, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values in which an interval is two columns."""
+    flat = {}
+    for name, value in values.items():
+        if name.endswith("interval"):
+            flat[f"{name}_low"], flat[f"{name}_high"] = value or (None, None)
+        else:
+            flat[name] = value
+    return flat
+
+
+def _latex(measures: Sequence[Compared]) -> str:
+    """A table (booktabs) with a row for each group and two columns for each measure."""
+    heads = [_escaped(measure.title) for measure in measures]
+    lines = [
+        rf"% median, and {100 * LEVEL:.0f} \% interval by the percentile bootstrap over runs",
+        rf"\begin{{tabular}}{{lr{'r' * len(measures)}}}",
+        r"\toprule",
+        " & ".join(["group", "runs", *heads]) + r" \\",
+        r"\midrule",
+    ]
+    for rows in zip(*(measure.averages for measure in measures), strict=True):
+        cells = []
+        for average in rows:
+            ends = average.median_interval
+            known = "" if ends is None else rf" [{_plain(ends[0])}, {_plain(ends[1])}]"
+            cells.append(f"{_plain(average.median)}{known}")
+        lines.append(" & ".join([_escaped(rows[0].group), str(rows[0].runs), *cells]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _plain(value: float) -> str:
+    return number(value) if np.isfinite(value) else "--"
+
+
+def _escaped(text: str) -> str:
+    for sign in ("\\", "_", "%", "&", "#", "$", "{", "}"):
+        text = text.replace(sign, r"\textbackslash{}" if sign == "\\" else "\\" + sign)
+    return text
+
+
+def checked_kind(file: Path) -> str:
+    """The kind of a file of statistics by its name. Raises ConfigError if it is none of FORMATS."""
+    if file.suffix not in FORMATS:
+        raise ConfigError(
+            f"--statistics {file}: its name must end with one of {', '.join(FORMATS)}",
+            field="statistics",
+            value=str(file),
+        )
+    return file.suffix
