@@ -46,7 +46,7 @@ def report(
     ] = None,
     figures: Annotated[
         Path | None,
-        typer.Option("--figures", parser=given_path, metavar="DIR", help="Also write each figure as SVG and PNG."),
+        typer.Option("--figures", parser=given_path, metavar="DIR", help="Also write each figure as SVG, PDF and PNG."),
     ] = None,
     paired: Annotated[
         bool, typer.Option("--paired", help="Test groups of compared runs by pairs of equal seeds.")

@@ -1,4 +1,4 @@
-"""Files of figures for a paper: each as SVG and as PNG."""
+"""Files of figures for a paper: each as SVG, PDF and PNG, as wide as a column or a page of two columns."""
 
 from __future__ import annotations
 
@@ -14,10 +14,17 @@ from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
 from es_service.report.overview import draw_overview
+from es_service.report.several_maps import over_seeds
 
-DPI = 200
-SIZE = (4.6, 3.4)
-"""Width and height of a figure in inches."""
+DPI = 300
+KINDS = ("svg", "pdf", "png")
+COLUMN, PAGE = 3.4, 7.0
+"""Width of a figure in inches: in a column, and over both columns of a page."""
+SIZE = (COLUMN, 2.6)
+"""Width and height of a figure in inches, unless it has several panels."""
+PANELS_IN_A_ROW = 4
+STYLE = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7, "lines.linewidth": 1.2, "pdf.fonttype": 42}
+"""Sizes of text as in a paper; text in a PDF stays text."""
 
 
 def empty_figure() -> Any:
@@ -49,39 +56,74 @@ def write_figures(
                 list(runs), figure.subplots(), column, group_by=keys
             )
     mapped = [run for run in runs if run.map is not None and run.map.size and len(run.names) <= 2]
+    if mapped:
+        drawings["archive_profile"] = lambda figure: plots.archive_profile(mapped, figure.subplots(), keys)
     if len(runs) == 1:
         if mapped:
             drawings["behaviour_map"] = lambda figure: _map(mapped[0], figure.subplots())
+            drawings["behaviour_map_over_time"] = lambda figure: _snapshots(mapped[0], figure)
             if len(mapped[0].names) == 2:
                 drawings["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
         drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
     else:
         drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
         drawings["profile"] = lambda figure: plots.profile(list(runs), figure.subplots(), group_by=keys)
-        if mapped:
-            colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
-            for index, group in enumerate(compare.grouped(runs, keys)):
-                if (run := compare.median_run(group)) in mapped:
-                    drawings[f"behaviour_map_{index}"] = lambda figure, run=run, name=group.name: _map(
-                        run, figure.subplots(), colours, name
-                    )
+        groups = compare.grouped(runs, keys)
+        if len(mapped) == len(runs):
+            drawings["behaviour_maps"] = lambda figure: _grid(figure, [
+                (group.name, compare.median_run(group)) for group in groups
+            ], "fitness")  # fmt: skip
+            drawings["behaviour_maps_median"] = lambda figure: _grid(figure, [
+                (group.name, over_seeds(group.runs, "median")) for group in groups
+            ], "median fitness")  # fmt: skip
+            drawings["behaviour_maps_filled"] = lambda figure: _grid(figure, [
+                (group.name, over_seeds(group.runs, "share")) for group in groups
+            ], "share of runs", (0.0, 1.0))  # fmt: skip
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, draw in drawings.items():
-            figure = empty_figure()
-            draw(figure)
-            for kind in ("svg", "png"):
-                written.append(folder / f"{name}.{kind}")
-                figure.savefig(written[-1], dpi=DPI)
+            with importlib.import_module("matplotlib").rc_context(STYLE):
+                figure = empty_figure()
+                draw(figure)
+                for kind in KINDS:
+                    written.append(folder / f"{name}.{kind}")
+                    figure.savefig(written[-1], dpi=DPI)
     except OSError as error:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
     return written
 
 
-def _map(run: RunData, axes: Any, colours: tuple[float, float] | None = None, title: str = "") -> None:
-    axes.figure.colorbar(plots.behaviour_map(run, axes, colours), label="fitness")
-    axes.set_title(title, parse_math=False)  # a name may contain a $
+def _map(run: RunData, axes: Any) -> None:
+    axes.figure.colorbar(plots.behaviour_map(run, axes), label="fitness")
+
+
+def _grid(
+    figure: Any, shown: Sequence[tuple[str, RunData]], label: str, colours: tuple[float, float] | None = None
+) -> None:
+    """Maps with their titles in rows, all with the same colours, and one bar of colours."""
+    maps = [run.map for _, run in shown if run.map is not None]
+    colours = colours or value_range(np.concatenate([map_.fitness_N for map_ in maps]))
+    across = min(PANELS_IN_A_ROW, len(shown))
+    rows = -(-len(shown) // across)
+    panel = PAGE / PANELS_IN_A_ROW
+    figure.set_size_inches(max(COLUMN, across * panel), rows * (panel + 0.25))
+    figure.set_layout_engine("constrained")
+    panels, drawn = figure.subplots(rows, across, squeeze=False).ravel(), None
+    for axes, (name, run) in zip(panels, shown, strict=False):
+        drawn = plots.behaviour_map(run, axes, colours)
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        axes.set_title(name, parse_math=False)  # a name may contain a $
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    figure.colorbar(drawn, ax=panels, label=label, aspect=30, fraction=0.03, pad=0.02)
+
+
+def _snapshots(run: RunData, figure: Any) -> None:
+    figure.set_size_inches(PAGE, PAGE / PANELS_IN_A_ROW + 0.4)
+    figure.set_layout_engine("constrained")
+    drawn = plots.snapshots(run, figure, PANELS_IN_A_ROW)
+    figure.colorbar(drawn, ax=figure.axes, label="fitness", aspect=30, fraction=0.03, pad=0.02)
 
 
 def _path(run: RunData, axes: Any) -> None:

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.system import given_path
-from es_service.report import between, compare, statistics
+from es_service.report import between, compare, several_maps, statistics
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
 from es_service.report.detours import detours
 from es_service.report.floor import beside_walls, is_plan
+from es_service.report.markup import tick_text
 from es_service.report.series import X_AXES, lone
 from es_service.runs.view import Run
 from es_service.search.maps.geometry import Grid, intervals
@@ -215,6 +216,54 @@ def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: 
     axes.set(ylim=(-0.02, 1.02), ylabel=f"share of runs at {'least' if sign > 0 else 'most'} here")
     axes.set_xlabel(title, parse_math=False)
     _frame(axes, legend=True)
+
+
+def archive_profile(runs: Source | Several, axes: Axes, group_by: Sequence[str] = ()) -> None:
+    """Draw archive profiles: the share of the cells of a map whose elite has at least each fitness.
+
+    Of several runs, the median of each group, with its interval as in `curves`. Raises NotInRunError for a run without
+    a map.
+    """
+    all_data = [_data(source) for source in (runs if isinstance(runs, list | tuple) else [runs])]
+    for data in all_data:
+        if data.map is None or not data.map.size:
+            raise NotInRunError(f"{data.folder} has no behaviour map with elites", run=data.folder)
+    groups = compare.grouped(all_data, group_by)
+    low, high = value_range(np.concatenate([data.map.fitness_N for data in all_data if data.map is not None]))
+    fitness_K = np.linspace(low, high, compare.POINTS)
+    for index, group in enumerate(groups):
+        share_R_K = np.stack([several_maps.profile(run.map, fitness_K) for run in group.runs if run.map is not None])
+        axes.plot(fitness_K, np.median(share_R_K, axis=0), label=group.name, **_style(index))
+        if (interval_2_K := group.interval(share_R_K)) is not None:
+            axes.fill_between(fitness_K, *interval_2_K, color=_style(index)["color"], alpha=0.18, linewidth=0)
+    axes.set(ylim=(0, None), xlabel="fitness", ylabel="share of cells with at least this fitness")
+    _frame(axes, legend=len(groups) > 1)
+
+
+def snapshots(run: Source, figure: Any, count: int = 4) -> Any:
+    """Draw the map of a run at equal intervals of its environment steps, side by side, the last at its end.
+
+    Each map is that of all evaluated centres until then; see `several_maps.until`.
+
+    Args:
+        figure: an empty figure of matplotlib, or a part of one.
+
+    Returns:
+        what `Figure.colorbar` takes. Raises NotInRunError as `behaviour_map`.
+    """
+    data = _data(run)
+    steps_G, generation_G = data.history["env_steps"], data.history["generation"]
+    if data.map is None or not steps_G.size:
+        raise NotInRunError(f"{data.folder} has no behaviour map", run=data.folder)
+    colours, drawn = value_range(data.map.fitness_N), None
+    panels = figure.subplots(1, count, squeeze=False, sharey=True).ravel()
+    for k, axes in enumerate(panels):
+        row = int(np.searchsorted(steps_G, steps_G[-1] * (k + 1) / count))
+        shown = data if k == count - 1 else several_maps.until(data, int(generation_G[row]))
+        drawn = behaviour_map(shown, axes, colours)
+        axes.set_title(f"{tick_text(float(steps_G[row]), 1.0)} steps", fontsize=9)
+        axes.label_outer()
+    return drawn
 
 
 def _style(index: int) -> dict[str, Any]:

@@ -11,14 +11,15 @@ import pytest
 from es_service import open_run, plots
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.options import choice
-from es_service.report import compare
+from es_service.report import compare, several_maps
 from es_service.report.compare_page import comparison_page
-from es_service.report.data import read_run
+from es_service.report.data import RunData, read_run
 from es_service.report.facts import number
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.floor import beside_walls
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
+from es_service.search.maps.behaviour_map import BehaviourMap
 from tests.database import execute
 from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
@@ -228,15 +229,56 @@ def test_a_run_without_generations_is_refused(runs, tmp_path):
 
 
 @pytest.mark.slow
-def test_figures_are_written_as_svg_and_png(folders, runs, tmp_path):
+def test_figures_are_written_as_svg_pdf_and_png(folders, runs, tmp_path):
     one = write_figures(runs[:1], tmp_path / "one")
     names = {"best_fitness", "goal_distance", "coverage", "qd_score", "behaviour_map", "trajectory", "centres"}
-    assert {file.name for file in one} == {f"{name}.{kind}" for name in names for kind in ("svg", "png")}
+    names |= {"archive_profile", "behaviour_map_over_time"}
+    assert {file.name for file in one} == {f"{name}.{kind}" for name in names for kind in ("svg", "pdf", "png")}
     assert all(file.stat().st_size > 2000 for file in one)
     page, *several = write_comparison(folders, tmp_path / "all.html", figures=tmp_path / "several")
     assert page.name == "all.html"
-    names = {"overview.png", "best_fitness.svg", "behaviour_map_0.png", "behaviour_map_1.png"}
+    names = {"overview.png", "best_fitness.svg", "behaviour_maps.pdf", "profile.png"}
+    names |= {"behaviour_maps_median.png", "behaviour_maps_filled.png", "archive_profile.png"}
     assert names <= {file.name for file in several}
+
+
+def map_of(run: RunData) -> BehaviourMap:
+    assert run.map is not None
+    return run.map
+
+
+def test_maps_over_seeds_have_the_share_of_the_runs_and_the_median_fitness(runs):
+    maps = [map_of(run) for run in runs[:3]]
+    for over in ("share", "median"):
+        found = map_of(several_maps.over_seeds(runs[:3], over))
+        for cell, value, descriptor_B in zip(found.cell_N, found.fitness_N, found.descriptor_N_B, strict=True):
+            rows = [(map_, map_.row_of(cell)) for map_ in maps]
+            there = [map_.fitness_N[row] for map_, row in rows if row is not None]
+            assert value == (len(there) / 3 if over == "share" else np.median(there))
+            assert found.geometry.cells_of(descriptor_B[None])[0] == cell
+        assert set(found.cell_N) == set(np.concatenate([map_.cell_N for map_ in maps]))
+    with pytest.raises(ValueError, match="do not have the same cells"):
+        several_maps.over_seeds([runs[0], replace(runs[1], map=None)], "share")
+
+
+def test_a_map_until_a_generation_has_the_fittest_of_each_cell(runs):
+    centres = runs[0].centres
+    columns = {"generation": [0, 1, 1, 2], "fitness_mean": [1.0, 3.0, 2.0, 9.0], "x": [0.11, 0.12, 0.51, 0.13]}
+    made = {name: np.array(values, float) for name, values in columns.items()} | {"y": np.full(4, 0.5)}
+    assert made.keys() <= centres.keys()
+    found = map_of(several_maps.until(replace(runs[0], centres=made), 1))
+    assert sorted(found.fitness_N) == [2.0, 3.0]
+    assert sorted(map_of(several_maps.until(replace(runs[0], centres=made), 2)).fitness_N) == [2.0, 9.0]
+
+
+def test_an_archive_profile_is_the_share_of_cells_at_least_as_fit(runs, axes):
+    map_ = map_of(runs[0])
+    fitness_K = np.array([-np.inf, *map_.fitness_N[:3], np.inf])
+    expected = [(map_.fitness_N >= fitness).sum() / map_.geometry.size for fitness in fitness_K]
+    np.testing.assert_array_equal(several_maps.profile(map_, fitness_K), expected)
+    plots.archive_profile(runs, axes)
+    assert [line.get_label() for line in axes.lines] == ["me_es", "es"]
+    assert len(axes.collections) == 2  # the intervals
 
 
 def test_figures_without_matplotlib_are_refused_before_anything_is_recorded(folders, tmp_path, monkeypatch):
