@@ -1,12 +1,15 @@
 """Messages about recorded episodes, for replays: which episode, what was seen, and what the bodies look like.
 
-Axes: T control steps of the episode, the reset included; L moving links; B descriptor dimensions.
+Axes: T control steps of the episode, the reset included; L links; B descriptor dimensions; V vertices; F triangles.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
 from es_service.protocol.noise import Domain, Keys, evaluation_reset_keys
@@ -42,21 +45,45 @@ class RecordRequest:
         return (self.policy + self.episode) % POLICY_SLOTS
 
 
+class Mesh(NamedTuple):
+    """A surface of triangles."""
+
+    vertices_V_3: FloatArray
+    """In the frame of a shape, in metres."""
+    triangles_F_3: NDArray[np.int32]
+    """The vertices of each triangle."""
+
+
 class Shape(NamedTuple):
-    """A body, as its task's MJCF describes it."""
+    """A part of a body, as its task's MJCF describes it."""
 
     kind: str
-    """plane, sphere, capsule, ellipsoid, cylinder or box."""
+    """plane, sphere, capsule, ellipsoid, cylinder, box or mesh."""
     link: int
     """The link that it moves with; -1 for the world."""
     size: tuple[float, ...]
-    """As in MJCF: half-lengths of a box, radius and half-length of a capsule, ..."""
+    """As in MJCF: half-lengths of a box, radius and half-length of a capsule, half-lengths of a plane, 0 if it has no
+    end; of a mesh half-lengths of the box around it."""
     position: tuple[float, ...]
     """In the frame of its link."""
     rotation: tuple[float, ...]
     """Quaternion (w, x, y, z) in the frame of its link."""
     colour: tuple[float, ...]
     """Red, green, blue and opacity, from 0 to 1."""
+    mesh: int | None = None
+    """Number of its mesh in the scene; None for the other kinds."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the bodies of a task look like."""
+
+    shapes: tuple[Shape, ...]
+    meshes: tuple[Mesh, ...]
+    notes: tuple[str, ...]
+    """Sentences on what is not drawn, or not as it is."""
+    step_s: float
+    """Seconds of a control step in the task's own time."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +105,5 @@ class Recordings:
     """The answer to several requests, in their order."""
 
     recordings: tuple[Recording, ...]
-    shapes: tuple[Shape, ...]
-    """The bodies of the task; empty if it has none."""
-    step_s: float
-    """Seconds of a control step in the task's own time; 0 if the task has no bodies."""
+    scene: Scene | None
+    """The bodies of the task; None if it has none."""

@@ -2,7 +2,7 @@
 
 Poses are stored as 16-bit integers: positions in steps of the recording's own range (a millimetre for a way of 65 m),
 quaternions in steps of 1/32767. The page turns them back into numbers and draws them; nothing is computed there that is
-reported.
+reported. Distances of the camera, of the grid and of marks follow from the size of the body that moves.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from es_service.errors import ServiceError
-from es_service.protocol.recordings import Recordings
+from es_service.protocol.recordings import Mesh, Scene, Shape
 from es_service.protocol.sources import task_code, user_path
 from es_service.report import floor
 from es_service.report.data import RunData
@@ -25,8 +25,11 @@ from es_service.runs.replay import CERTIFIED, Replay, record
 MOST_CELLS = 8
 """Elites that are replayed in one page, besides the best centre; each ant takes half a megabyte."""
 SPEEDS = (0.25, 0.5, 1, 2, 4, 8)
+HELP = "Drag to turn; scroll or pinch to zoom; drag with the right button or with two fingers to move."
 PLAIN_STEP_S = 0.05
 """Seconds of a step in the replay of a task that has no time of its own."""
+STILL = 1e-4
+"""Metres, and differences of quaternions, by which a link may differ in an episode in which it does not move."""
 
 
 def replay_section(
@@ -56,11 +59,11 @@ def replay_section(
         replays, recorded = record(run, best=best, cells=cells, certified=certified)
     except ServiceError as error:
         return _no_replay(f"No episode could be recorded on this machine: {error.sentence}")
-    solid = bool(recorded.shapes) and all(replay.recording.poses_T_L_7 is not None for replay in replays)
-    scripts = {"replay": _solid(data, replays, recorded) if solid else _flat(data, replays)}
-    libraries = [asset("three.bundle.js")] if solid else []
+    scene = recorded.scene if recorded.scene and recorded.scene.shapes else None
+    scripts = {"replay": _flat(data, replays) if scene is None else _solid(data, replays, scene)}
+    libraries = [] if scene is None else [asset("three.bundle.js")]
     return {
-        "section": _section(data, replays, solid=solid),
+        "section": _section(data, replays, scene),
         "scripts": scripts,
         "libraries": [*libraries, asset("replay.js")],
     }
@@ -112,7 +115,7 @@ def _notes(replay: Replay, hidden: str | None) -> Markup:
     return tag("p", f"{text} {other} {why}", class_="problem episode", hidden=hidden)
 
 
-def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup:
+def _section(data: RunData, replays: Sequence[Replay], scene: Scene | None) -> Markup:
     options = [tag("option", _title(replay), value=index) for index, replay in enumerate(replays)]
     speeds = [tag("option", f"{speed:g} x", value=speed, selected="" if speed == 1 else None) for speed in SPEEDS]
     longest = max(replay.recording.returns_T.size for replay in replays) - 1
@@ -123,7 +126,7 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
     plan = tag("svg", floor.ground(frame, _labels(data, replays)), floor.walls_and_goal(frame, data.task),
                tag("g", class_="path"), viewBox="0 0 {:.0f} {:.0f}".format(*floor.size(frame)), class_="map",
                role="img", aria_label="Path from above")  # fmt: skip
-    stage = tag("div", tag("canvas", id="stage"), class_="stage", id="stage-box") if solid else None
+    stage = None if scene is None else tag("div", tag("canvas", id="stage"), class_="stage", id="stage-box")
     return section(
         "Replay",
         tag(
@@ -132,42 +135,43 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
             tag("button", "Play", id="play", type="button"),
             scrub,
             tag("label", "speed ", tag("select", *speeds, id="speed")),
-            tag("label", follow, " follow") if solid else None,
+            None if scene is None else tag("label", follow, " follow"),
             class_="controls",
         ),
         tag("p", id="step", class_="readout"),
         stage,
-        tag("div", plan, class_="stage flat", id="plan", hidden="" if solid else None),
+        tag("div", plan, class_="stage flat", id="plan", hidden=None if scene is None else ""),
         *(_notes(replay, "" if i else None) for i, replay in enumerate(replays)),
-        tag(
-            "p",
-            "Drag to turn; scroll or pinch to zoom; drag with the right button or with two fingers to move.",
-            class_="note",
-        )
-        if solid
-        else None,
+        *(tag("p", text, class_="note") for text in (() if scene is None else (HELP, *scene.notes))),
         id_="replay",
     )
 
 
 def _labels(data: RunData, replays: Sequence[Replay]) -> tuple[str, str]:
     first, *others = data.names
-    if _shows_body(data, replays[0]):
+    if _bodies_way(data, replays[0]) is not None:
         return "x", "y"
     return (first, others[0]) if others else ("step of the episode", first)
 
 
-def _shows_body(data: RunData, replay: Replay) -> bool:
-    """Whether the path is that of the first body, because the descriptor is no place on the floor."""
-    return replay.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names)
+def _bodies_way(data: RunData, replay: Replay) -> np.ndarray | None:
+    """[T, 3] path of the body, if the task has one and the descriptor is no place on the floor."""
+    poses_T_L_7 = replay.recording.poses_T_L_7
+    if poses_T_L_7 is None or floor.is_plan(data.task, data.names):
+        return None
+    return poses_T_L_7[:, followed_link(poses_T_L_7), :3]
+
+
+def followed_link(poses_T_L_7: np.ndarray) -> int:
+    """The first link that moves or turns, as the bases of robots do and the things around them do not."""
+    return int((np.ptp(poses_T_L_7, axis=0) > STILL).any(axis=1).argmax())
 
 
 def _plane(data: RunData, replay: Replay) -> tuple[np.ndarray, np.ndarray]:
     """x and y of a path in the plane: of a body, or the first two dimensions, or one dimension against time."""
     way_T_B = replay.recording.descriptor_T_B
-    if _shows_body(data, replay):
-        assert replay.recording.poses_T_L_7 is not None
-        return replay.recording.poses_T_L_7[:, 0, 0], replay.recording.poses_T_L_7[:, 0, 1]
+    if (way_T_3 := _bodies_way(data, replay)) is not None:
+        return way_T_3[:, 0], way_T_3[:, 1]
     if way_T_B.shape[1] == 1:
         return np.arange(len(way_T_B), dtype=float), way_T_B[:, 0]
     return way_T_B[:, 0], way_T_B[:, 1]
@@ -192,11 +196,11 @@ def _flat(data: RunData, replays: Sequence[Replay]) -> dict[str, Any]:
     return {"solid": False, "step_s": PLAIN_STEP_S, "episodes": episodes}
 
 
-def _solid(data: RunData, replays: Sequence[Replay], recorded: Recordings) -> dict[str, Any]:
+def _solid(data: RunData, replays: Sequence[Replay], scene: Scene) -> dict[str, Any]:
     """Poses of all links, and the shapes that move with them."""
     flat = _flat(data, replays)
     for replay, episode in zip(replays, flat["episodes"], strict=True):
-        poses = np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64))
+        poses = _poses(replay)
         low, high = poses[..., :3].min(axis=(0, 1)), poses[..., :3].max(axis=(0, 1))
         size = np.maximum(high - low, 1e-6) / 65535.0
         episode |= {
@@ -205,12 +209,47 @@ def _solid(data: RunData, replays: Sequence[Replay], recorded: Recordings) -> di
             "positions": packed((poses[..., :3] - low) / size, "uint16"),
             "rotations": packed(poses[..., 3:] * 32767.0, "int16"),
         }
-    links = replays[0].recording.poses_T_L_7
-    assert links is not None
+    first = _poses(replays[0])
+    floors = [shape.position[2] for shape in scene.shapes if is_floor(shape)]
     return flat | {
         "solid": True,
-        "step_s": recorded.step_s,
-        "links": links.shape[1],
-        "shapes": [shape._asdict() for shape in recorded.shapes],
+        "step_s": scene.step_s,
+        "links": first.shape[1],
+        "followed": followed_link(first),
+        "reach": reach_of(first, scene),
+        "floor": max(floors) if floors else None,
+        "ground": max(floors) if floors else float(min(_poses(replay)[..., 2].min() for replay in replays)),
+        "shapes": [{**shape._asdict(), "floor": is_floor(shape)} for shape in scene.shapes],
+        "meshes": [packed_mesh(mesh) for mesh in scene.meshes],
         "goal": None if data.task.goal is None else list(data.task.goal),
     }
+
+
+def _poses(replay: Replay) -> np.ndarray:
+    """[T, L, 7] poses in double precision; 0 where they are not finite."""
+    return np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64))
+
+
+def packed_mesh(mesh: Mesh) -> dict[str, Any]:
+    """A mesh with vertices in steps of 1/32767 of its extent."""
+    unit = max(float(np.abs(mesh.vertices_V_3).max()), 1e-9) / 32767.0
+    triangles = packed(mesh.triangles_F_3, "uint32")
+    return {"unit": unit, "vertices": packed(mesh.vertices_V_3 / unit, "int16"), "triangles": triangles}
+
+
+def is_floor(shape: Shape) -> bool:
+    """Whether a shape is a plane of the world whose upper side is up."""
+    _, x, y, _ = shape.rotation
+    return shape.kind == "plane" and shape.link < 0 and 1.0 - 2.0 * (x * x + y * y) > 0.9999
+
+
+def reach_of(poses_T_L_7: np.ndarray, scene: Scene) -> float:
+    """Metres from the followed link at the start to the farthest end of a shape that moves, at most."""
+    start_L_3, moves_L = poses_T_L_7[0, :, :3], (np.ptp(poses_T_L_7, axis=0) > STILL).any(axis=1)
+    centre_3 = start_L_3[followed_link(poses_T_L_7)]
+    ends = [
+        np.linalg.norm(start_L_3[shape.link] - centre_3) + np.linalg.norm(shape.position) + np.linalg.norm(shape.size)
+        for shape in scene.shapes
+        if shape.link >= 0 and moves_L[shape.link]
+    ]
+    return float(max(ends, default=1.0))

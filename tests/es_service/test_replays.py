@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
@@ -11,6 +12,8 @@ import pytest
 from es_service import api
 from es_service.errors import NotInRunError
 from es_service.loop import finished
+from es_service.protocol.recordings import Mesh, Scene, Shape
+from es_service.report.replays import followed_link, is_floor, packed_mesh, reach_of
 from es_service.report.write import write_report
 from es_service.runs.certification import certify_run
 from es_service.runs.replay import record
@@ -24,6 +27,7 @@ CONFIG = {
     "budget": {"generations": 2},
     "compute": {"engine": "inline", "workers": 1, "inline_workers": "threads"},
 }
+UP, GREY = (1.0, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -142,3 +146,50 @@ def test_a_replay_executes_code_that_a_config_names_only_if_that_is_trusted(tmp_
 def angle(episode):
     """A descriptor of an episode of Pendulum-v1."""
     return [float(np.clip(episode.observation_O[0], -1, 1))]
+
+
+def shape(kind: str, link: int, size: tuple[float, ...], **named) -> Shape:
+    return Shape(kind, link, size, **{"position": (0.0, 0.0, 0.0), "rotation": UP, "colour": GREY, **named})
+
+
+def test_the_camera_follows_what_moves_from_as_far_as_it_reaches():
+    """A robot of three links beside a post; a far wall, and a target that stays where it is, do not count."""
+    poses_T_L_7 = np.zeros((3, 4, 7))
+    poses_T_L_7[..., 3] = 1.0
+    poses_T_L_7[:, 0, 0] = 50.0  # the post
+    poses_T_L_7[:, 1, :2] = (1.0, 0.0), (1.1, 0.0), (1.2, 0.0)
+    poses_T_L_7[:, 2, :2] = (1.5, 0.0), (1.5, 0.1), (1.5, 0.2)
+    poses_T_L_7[:, 3, 1] = -20.0  # the target
+    shapes = (
+        shape("box", -1, (100.0, 1.0, 1.0)),
+        shape("sphere", 0, (9.0, 0.0, 0.0)),
+        shape("sphere", 1, (0.25, 0.0, 0.0)),
+        shape("box", 2, (0.3, 0.4, 0.0), position=(0.0, 0.0, 1.0)),
+        shape("sphere", 3, (7.0, 0.0, 0.0)),
+    )
+    assert followed_link(poses_T_L_7) == 1
+    assert reach_of(poses_T_L_7, Scene(shapes, (), (), 0.1)) == pytest.approx(0.5 + 1.0 + 0.5)
+    turns = poses_T_L_7[:1].repeat(3, axis=0)
+    turns[:, 2, 3:] = (1.0, 0.0, 0.0, 0.0), (0.8, 0.6, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)
+    assert followed_link(turns) == 2
+
+
+def test_a_floor_is_a_plane_of_the_world_that_looks_up():
+    tilted = (np.cos(0.3), np.sin(0.3), 0.0, 0.0)
+    turned = (np.cos(0.3), 0.0, 0.0, np.sin(0.3))
+    planes = {
+        "flat": shape("plane", -1, (0.0, 0.0, 1.0)),
+        "turned about z": shape("plane", -1, (0.0, 0.0, 1.0), rotation=turned),
+        "tilted": shape("plane", -1, (0.0, 0.0, 1.0), rotation=tilted),
+        "of a body": shape("plane", 0, (0.0, 0.0, 1.0)),
+        "a box": shape("box", -1, (1.0, 1.0, 1.0)),
+    }
+    assert [name for name, plane in planes.items() if is_floor(plane)] == ["flat", "turned about z"]
+
+
+def test_a_mesh_is_packed_in_steps_of_its_extent():
+    vertices_V_3 = np.array([[0.0, 0.5, -0.25], [1e-3, 0.0, 0.0], [0.0, 0.0, 0.1]])
+    mesh = packed_mesh(Mesh(vertices_V_3, np.array([[0, 1, 2]], np.int32)))
+    places = np.frombuffer(base64.b64decode(mesh["vertices"]), "<i2").reshape(-1, 3) * mesh["unit"]
+    np.testing.assert_allclose(places, vertices_V_3, atol=0.5 / 32767)
+    assert np.frombuffer(base64.b64decode(mesh["triangles"]), "<u4").tolist() == [0, 1, 2]

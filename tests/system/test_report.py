@@ -168,7 +168,7 @@ SLALOM = "tests.examples.ant_slalom:AntSlalom"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["ant_maze", "ant_trap", "brax:hopper", SLALOM])
+@pytest.mark.parametrize("name", ["ant_maze", "ant_trap", "brax:hopper", "mujoco:Reacher-v5", SLALOM])
 def test_bodies_are_replayed_in_three_dimensions(page, tmp_path, name):
     environment = {"PYTHONPATH": str(ROOT)}
     settings = {"map.enabled": False, "search.algorithm": "es"}

@@ -93,7 +93,7 @@ class NumPy(RolloutBackend):
             returns_T = np.cumsum([0.0, *rewards_T], dtype=np.float32)
             return Recording(places_T_B, returns_T, None, float(found.fitness), found.trace_T_B)
 
-        return Recordings(tuple(map(one, requests)), (), 0.0)
+        return Recordings(tuple(map(one, requests)), None)
 
     def random_steps(self, task: TaskSpec, options: Mapping[str, Any], batch: int, steps: int) -> Callable[[int], int]:
         """Steps of each environment of the batch, one after another."""

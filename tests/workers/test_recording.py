@@ -2,19 +2,20 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain
-from es_service.protocol.recordings import RecordRequest
+from es_service.protocol.recordings import RecordRequest, Scene
 from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
 from workers import environments
 from workers.environments import SHIPPED
 from workers.recording import record
-from workers.viewer import shapes
+from workers.viewer import Viewer, scene
 
 
 def spec_of(name, rollout, steps):
@@ -95,20 +96,89 @@ def test_the_poses_of_an_ant_are_those_of_its_links(name):
     # A lower leg hangs from its upper leg, 0.2 m along x and y, wherever the ant is.
     along = np.linalg.norm(one.poses_T_L_7[:, 2, :3] - one.poses_T_L_7[:, 1, :3], axis=-1)
     np.testing.assert_allclose(along, np.hypot(0.2, 0.2), atol=0.05)
-    walls = [shape for shape in found.shapes if shape.kind == "box"]
+    shapes = found.scene.shapes
+    walls = [shape for shape in shapes if shape.kind == "box"]
     assert len(walls) == len(SHIPPED[name].walls)
     assert {shape.link for shape in walls} == {-1}
-    assert {shape.link for shape in found.shapes if shape.kind == "capsule"} == set(range(9))
-    assert found.step_s == pytest.approx(0.05)
+    assert {shape.link for shape in shapes if shape.kind == "capsule"} == set(range(9))
+    assert found.scene.step_s == pytest.approx(0.05)
 
 
-def test_shapes_of_meshes_and_of_hidden_groups_are_left_out():
+def test_the_poses_of_a_task_of_mujoco_are_those_of_c_mujoco():
+    """Also those of bodies that nothing moves, and of the world's geoms, which have link -1."""
+    from workers.environments.mujoco_parts import mujoco, mujoco_viewer, put_model, start
+
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="post" pos="0 2 1"><geom size="0.1"/></body>
+        <body pos="0 0 1"><joint type="slide" axis="1 0 0"/><geom size="0.1"/><body pos="0.5 0 0" euler="0 0 90">
+        <joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 1 0 0" size="0.05"/></body></body>
+        </worldbody></mujoco>"""
+    )
+    mx, data = put_model(model), mujoco.MjData(model)
+    viewer = mujoco_viewer(model, mx, 0.05, lambda state: state["physics"])
+    data.qpos[:] = 0.7, -0.4
+    mujoco.mj_kinematics(model, data)
+    poses = jax.jit(viewer.poses)({"physics": start(mx, data.qpos)})
+    np.testing.assert_allclose(poses.pos, data.xpos[1:], atol=1e-6)
+    np.testing.assert_allclose(poses.rot, data.xquat[1:], atol=1e-6)
+    seen = scene(viewer)
+    assert [(shape.kind, shape.link) for shape in seen.shapes] == [
+        ("plane", -1), ("sphere", 0), ("sphere", 1), ("capsule", 2),
+    ]  # fmt: skip
+    assert (seen.step_s, seen.notes) == (0.05, ())
+
+
+TETRAHEDRON = 'vertex="0 0 0 1 0 0 0 1 0 0 0 1"'
+
+
+def scene_of(assets: str, bodies: str) -> Scene:
     import mujoco
 
-    xml = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>
+    xml = f"<mujoco><asset>{assets}</asset><worldbody>{bodies}</worldbody></mujoco>"
+    return scene(Viewer(mujoco.MjModel.from_xml_string(xml), lambda state: None, 0.1))
+
+
+def test_geoms_and_sites_of_hidden_groups_and_without_colour_are_left_out():
+    seen = scene_of(
+        "",
+        """<geom type="plane" size="1 1 1"/><body><freejoint/>
         <geom type="sphere" size="0.3" pos="0 0 1" rgba="1 0 0 1"/><geom type="box" size="1 2 3" group="3"/>
-        <geom type="box" size="1 2 3" rgba="0 0 0 0"/></body></worldbody></mujoco>"""
-    plane, sphere = shapes(mujoco.MjModel.from_xml_string(xml))
+        <geom type="box" size="1 2 3" rgba="0 0 0 0"/><site type="cylinder" size="0.1 0.2"/><site group="4"/></body>""",
+    )
+    plane, sphere, site = seen.shapes
     assert (plane.kind, plane.link) == ("plane", -1)
     assert (sphere.kind, sphere.link, sphere.size[0], sphere.position) == ("sphere", 0, 0.3, (0.0, 0.0, 1.0))
     assert sphere.colour == (1.0, 0.0, 0.0, 1.0)
+    assert (site.kind, site.link, site.size[:2]) == ("cylinder", 0, (0.1, 0.2))
+
+
+def test_a_geom_has_the_colour_of_its_material_unless_it_has_its_own():
+    seen = scene_of(
+        '<material name="red" rgba="1 0 0 0.5"/>',
+        '<body><freejoint/><geom size="1" material="red"/><geom size="1" material="red" rgba="0 1 0 1"/></body>',
+    )
+    assert [shape.colour for shape in seen.shapes] == [(1.0, 0.0, 0.0, 0.5), (0.0, 1.0, 0.0, 1.0)]
+
+
+def test_meshes_are_those_of_the_model_and_what_is_not_drawn_is_said(monkeypatch):
+    """Two geoms share a mesh; the points of a geom are where C MuJoCo has them."""
+    assets = (
+        f'<mesh name="unused" {TETRAHEDRON}/><mesh name="a" {TETRAHEDRON}/><mesh name="b" {TETRAHEDRON} scale="2 2 2"/>'
+        '<hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/>'
+    )
+    bodies = """<geom type="hfield" hfield="h"/><body pos="0 0 3"><freejoint/><geom type="mesh" mesh="b"/>
+        <geom type="mesh" mesh="a" pos="5 0 0"/><geom type="mesh" mesh="b" pos="9 0 0"/></body>"""
+    seen = scene_of(assets, bodies)
+    assert [shape.mesh for shape in seen.shapes] == [1, 0, 1]
+    assert seen.notes == ("Not drawn: height fields (1).",)
+    first = seen.shapes[0]
+    w, *v = first.rotation
+    places = [place + 2 * np.cross(v, np.cross(v, place) + w * place) for place in seen.meshes[1].vertices_V_3]
+    wanted = {(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.0)}
+    assert {tuple(np.abs(np.round(place + first.position, 3)).tolist()) for place in places} == wanted
+    monkeypatch.setattr("workers.viewer.MOST_TRIANGLES", 3)
+    hulls = scene_of(assets, bodies)
+    assert hulls.notes[0] == "Meshes of more than 3 triangles are drawn as their convex hulls: 2."
+    faces = [{frozenset(face) for face in found.meshes[1].triangles_F_3.tolist()} for found in (seen, hulls)]
+    assert faces[0] == faces[1]
+    assert len(faces[0]) == 4

@@ -49,7 +49,7 @@ def test_a_run_and_its_replays_with_another_rollout_are_those_of_xla(search, tmp
     cells = list(run.map[["cell_x", "cell_y"]].head(2).itertuples(index=False, name=None))
     replays, recordings = record(run, best=True, cells=cells)
     assert [one.is_the_stored for one in replays] == [True] * (1 + len(cells))
-    assert recordings.shapes == ()
+    assert recordings.scene is None
 
 
 @pytest.mark.slow

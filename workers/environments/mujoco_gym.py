@@ -22,11 +22,10 @@ import numpy as np
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.options import Option, OptionValue, choice
 from workers.environments import Environment, TaskError
-from workers.environments.brax_parts import Transform, quietly
+from workers.environments.brax_parts import quietly
 from workers.environments.gymnasium_task import gymnasium_package
 from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, GymState, GymTask, Parts, Simulated
-from workers.environments.mujoco_parts import MjModel, forward, mujoco, put_model, start, step_and_look
-from workers.viewer import Viewer
+from workers.environments.mujoco_parts import MjModel, forward, mujoco, mujoco_viewer, put_model, start, step_and_look
 
 FAR = 30.0
 """Bound of descriptors whose range is not specified, in metres or in the unit of the joint."""
@@ -105,17 +104,13 @@ def make(
         after = GymState(*step_and_look(mx, state.physics, bounded_A, substeps, lambda data: parts.look(data, True)))
         return after, *parts.outcome(state, after, bounded_A)
 
-    def poses(state: GymState) -> Transform:
-        data = forward(mx, state.physics, jnp.zeros(model.nu))
-        return Transform(data.xpos[1:], data.xquat[1:])
-
     return Environment(
         reset,
         parts.observe,
         step,
         lambda state: state.physics.qpos[places],
         lambda state: jnp.float32(jnp.nan),
-        viewer=Viewer(model, poses, step_s),
+        viewer=mujoco_viewer(model, mx, step_s, lambda state: state.physics),
     )
 
 

@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from workers.environments import TaskError
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_parts import Transform, quietly
+from workers.viewer import Viewer
 
 mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains
 with quietly():
@@ -193,6 +194,22 @@ def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
     """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors."""
     with _contacts_as_c():
         return mjx.forward(model, _data(mjx.make_data(model), state, ctrl))
+
+
+def mujoco_viewer(model: MjModel, mx: mjx.Model, step_s: float, physics: Callable[[Any], MujocoState]) -> Viewer:
+    """Data for replays of a task with a model.
+
+    Args:
+        mx: MJX's model.
+        step_s: seconds of a control step.
+        physics: function from a state of the task to that of the model.
+    """
+
+    def poses(state: Any) -> Transform:
+        data: Any = mjx.kinematics(mx, _data(mjx.make_data(mx), physics(state), jnp.zeros(model.nu)))
+        return Transform(data.xpos[1:], data.xquat[1:])
+
+    return Viewer(model, poses, step_s)
 
 
 @collision_primitive.collider(ncon=2)

@@ -71,7 +71,7 @@ class Host(RolloutBackend):
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""
         run, _ = make_runner(spec)
-        return Recordings(tuple(_recording(run, request) for request in requests), (), 0.0)
+        return Recordings(tuple(_recording(run, request) for request in requests), None)
 
     def random_steps(
         self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int

@@ -26,7 +26,7 @@ from workers.rollouts.backend import (
     FailedEpisode,
     observation_text,
 )
-from workers.viewer import shapes
+from workers.viewer import scene
 
 
 def judged(functions: ChunkFunctions, spec: WorkerSpec) -> ChunkFunctions:
@@ -90,9 +90,7 @@ def record(
     watched = {own: make_watched_rollout(environment, spec, per_lane_weights=own) for own in (False, True)}
     viewer = environment.viewer
     recordings = tuple(_record(environment, watched, request) for request in requests)
-    return Recordings(
-        recordings, shapes(viewer.model) if viewer is not None else (), viewer.step_s if viewer is not None else 0.0
-    )
+    return Recordings(recordings, None if viewer is None else scene(viewer))
 
 
 def _record(

@@ -1,5 +1,6 @@
 // Replays: the recorded poses, drawn with three.js where the page has WebGL, else the path from above.
 "use strict";
+const BOTH_SIDES = 2; // of a surface, as three.js numbers them
 let endReplay = () => {};
 window.report.start.replay = () => {
   endReplay(); // of the replay that this one replaces
@@ -40,10 +41,10 @@ window.report.start.replay = () => {
   const solid = () => {
     const T = window.THREE, canvas = byId("stage"), box = byId("stage-box");
     const renderer = new T.WebGLRenderer({ canvas, antialias: true });
-    const scene = new T.Scene(), camera = new T.PerspectiveCamera(45, 1, 0.1, 500);
+    const scene = new T.Scene(), camera = new T.PerspectiveCamera(45, 1, 0.08 * data.reach, 1);
     camera.up.set(0, 0, 1);
     const orbit = new T.OrbitControls(camera, canvas);
-    orbit.maxPolarAngle = Math.PI * 0.495;
+    if (data.floor !== null) orbit.maxPolarAngle = Math.PI * 0.495;
     const sky = new T.HemisphereLight(0xffffff, 0x8a939c);
     scene.add(sky);
     const sun = new T.DirectionalLight(0xffffff, 1.8);
@@ -51,40 +52,53 @@ window.report.start.replay = () => {
     scene.add(sun);
     const colour = (name) => new T.Color(getComputedStyle(document.documentElement).getPropertyValue(name).trim());
     const links = Array.from({ length: data.links }, () => { const link = new T.Group(); scene.add(link); return link; });
-    const geometry = ({ kind, size: [a, b, c] }) => {
+    const surfaces = data.meshes.map(({ unit, vertices, triangles }) => {
+      const places = Float32Array.from(new Int16Array(bytes(vertices)), (x) => x * unit);
+      const surface = new T.BufferGeometry().setAttribute("position", new T.Float32BufferAttribute(places, 3));
+      return surface.setIndex([...new Uint32Array(bytes(triangles))]);
+    });
+    const far = 60 * data.reach; // where a plane without an end seems to end
+    const geometry = ({ kind, floor: isFloor, mesh, size: [a, b, c] }) => {
       switch (kind) {
         case "sphere": return new T.SphereGeometry(a, 24, 16);
         case "capsule": return new T.CapsuleGeometry(a, 2 * b, 6, 16).rotateX(Math.PI / 2);
         case "cylinder": return new T.CylinderGeometry(a, a, 2 * b, 24).rotateX(Math.PI / 2);
         case "ellipsoid": return new T.SphereGeometry(1, 24, 16).scale(a, b, c);
         case "box": return new T.BoxGeometry(2 * a, 2 * b, 2 * c);
-        default: return null;
+        case "mesh": return surfaces[mesh];
+        default: return isFloor ? null : new T.PlaneGeometry(2 * a || far, 2 * b || far);
       }
     };
     for (const shape of data.shapes) {
       const form = geometry(shape);
       if (!form) continue; // the floor is drawn below, as large as the path
+      const facets = shape.kind === "mesh" || shape.kind === "plane"; // without normals, and open
       const [red, green, blue, opacity] = shape.colour;
-      const mesh = new T.Mesh(form, new T.MeshLambertMaterial({ color: new T.Color(red, green, blue).convertSRGBToLinear(), opacity, transparent: opacity < 1 }));
+      const mesh = new T.Mesh(form, new T.MeshLambertMaterial({ color: new T.Color(red, green, blue).convertSRGBToLinear(), opacity, transparent: opacity < 1, flatShading: facets, side: facets ? BOTH_SIDES : 0 }));
       const [w, x, y, z] = shape.rotation;
       mesh.quaternion.set(x, y, z, w);
       mesh.position.set(...shape.position);
       (shape.link < 0 ? scene : links[shape.link]).add(mesh);
     }
     if (data.goal) {
-      const goal = new T.Mesh(new T.CylinderGeometry(0.8, 0.8, 0.1, 32).rotateX(Math.PI / 2), new T.MeshLambertMaterial({ color: colour("--goal") }));
-      goal.position.set(data.goal[0], data.goal[1], 0.05);
+      const radius = 0.65 * data.reach, height = 0.08 * data.reach;
+      const goal = new T.Mesh(new T.CylinderGeometry(radius, radius, height, 32).rotateX(Math.PI / 2), new T.MeshLambertMaterial({ color: colour("--goal") }));
+      goal.position.set(data.goal[0], data.goal[1], data.ground + 0.5 * height);
       scene.add(goal);
     }
     const floor = new T.Mesh(new T.PlaneGeometry(1, 1), new T.MeshLambertMaterial({ polygonOffset: true, polygonOffsetFactor: 4, polygonOffsetUnits: 4 }));
-    floor.position.z = -0.005;
-    scene.add(floor);
+    floor.position.z = data.ground - 0.004 * data.reach;
+    if (data.floor !== null) scene.add(floor);
     let grid = null, path = null;
     const place = (k, link, target) => {
       const { positions, low, size } = episodes[current], first = 3 * (k * data.links + link);
       return target.set(...[0, 1, 2].map((axis) => low[axis] + positions[first + axis] * size[axis]));
     };
     const at = new T.Vector3(), before = new T.Vector3(), middle = new T.Vector3();
+    const line = (points, name) => new T.Line(
+      new T.BufferGeometry().setAttribute("position", new T.Float32BufferAttribute(points.flat(), 3)),
+      new T.LineBasicMaterial({ color: colour(name) }),
+    );
     const dress = () => {
       scene.background = colour("--ground");
       floor.material.color = colour("--paper");
@@ -92,29 +106,38 @@ window.report.start.replay = () => {
     };
     const aim = () => { // from the south and above; near enough to see the body, or the whole path
       const { low, size } = episodes[current];
-      const width = Math.max(6, 65535 * size[0], 65535 * size[1]);
-      const far = (byId("follow").checked ? 6 : width * 1.25) * Math.max(1, 1.4 * box.clientHeight / box.clientWidth);
-      if (byId("follow").checked) place(step, 0, middle);
-      else middle.set(low[0] + 32767 * size[0], low[1] + 32767 * size[1], 0);
+      const width = Math.max(65535 * size[0], 65535 * size[1]);
+      const away = Math.max(4 * data.reach, byId("follow").checked ? 0 : 1.25 * width) * Math.max(1, 1.4 * box.clientHeight / box.clientWidth);
+      if (byId("follow").checked) place(step, data.followed, middle);
+      else middle.set(low[0] + 32767 * size[0], low[1] + 32767 * size[1], data.ground);
       orbit.target.copy(middle);
-      camera.position.set(middle.x - 0.25 * far, middle.y - 0.85 * far, middle.z + 0.7 * far);
+      camera.position.set(middle.x - 0.25 * away, middle.y - 0.85 * away, middle.z + 0.7 * away);
     };
     return {
       load() {
         const { steps, low, size } = episodes[current];
+        if (path) for (const old of [path, grid]) { scene.remove(old); old.geometry.dispose(); old.material.dispose(); }
         const points = [];
-        for (let k = 0; k <= steps; k++) { place(k, 0, at); points.push(at.x, at.y, 0.02); }
-        if (path) { scene.remove(path); path.geometry.dispose(); scene.remove(grid); grid.dispose(); }
-        path = new T.Line(new T.BufferGeometry().setAttribute("position", new T.Float32BufferAttribute(points, 3)), new T.LineBasicMaterial({ color: colour("--goal") }));
-        const width = 2 * Math.ceil(Math.max(20, 65535 * size[0], 65535 * size[1], 90 * (data.goal ? 1 : 0)));
-        floor.scale.set(2 * width, 2 * width, 1);
+        for (let k = 0; k <= steps; k++) { place(k, data.followed, at); points.push([at.x, at.y, data.ground + 0.016 * data.reach]); }
+        path = line(points, "--goal");
+        const unit = 10 ** Math.round(Math.log10(data.reach)); // a metre for a robot of that size
+        const extent = Math.max(20 * unit, 65535 * size[0], 65535 * size[1], 90 * unit * (data.goal ? 1 : 0));
+        const square = extent <= 30 * unit ? unit : 5 * unit, half = Math.ceil(extent / square), corners = [];
+        camera.far = 20 * extent;
+        floor.scale.set(4 * half * square, 4 * half * square, 1);
         floor.position.x = low[0] + 32767 * size[0];
         floor.position.y = low[1] + 32767 * size[1];
-        grid = new T.GridHelper(width, width <= 60 ? width : width / 5, colour("--line"), colour("--line"));
-        grid.rotation.x = Math.PI / 2;
-        grid.position.set(Math.round(floor.position.x), Math.round(floor.position.y), 0);
+        // To and fro from corner to corner: of long lines with an end behind the camera, some renderers draw nothing.
+        for (let i = -half; i <= half; i++) {
+          for (let j = -half; j <= half; j++) corners.push([i * square, ((i + half) % 2 ? -j : j) * square, 0]);
+        }
+        for (let j = half; j >= -half; j--) {
+          for (let i = half; i >= -half; i--) corners.push([((half - j) % 2 ? -i : i) * square, j * square, 0]);
+        }
+        grid = line(corners, "--line");
+        grid.position.set(unit * Math.round(floor.position.x / unit), unit * Math.round(floor.position.y / unit), data.ground);
         scene.add(path, grid);
-        place(0, 0, before);
+        place(0, data.followed, before);
         aim();
       },
       aim,
@@ -125,7 +148,7 @@ window.report.start.replay = () => {
           const first = 4 * (step * data.links + number);
           link.quaternion.set(rotations[first + 1], rotations[first + 2], rotations[first + 3], rotations[first]).normalize();
         });
-        place(step, 0, at);
+        place(step, data.followed, at);
         if (byId("follow").checked) {
           camera.position.add(at).sub(before);
           orbit.target.copy(at);
@@ -139,6 +162,7 @@ window.report.start.replay = () => {
         renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
         renderer.setSize(width, height, false);
         camera.aspect = width / height;
+        camera.updateProjectionMatrix();
         dress();
         renderer.render(scene, camera);
         canvas.dataset.triangles = renderer.info.render.triangles;
