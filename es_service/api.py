@@ -15,14 +15,15 @@ from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
+from es_service.protocol.evaluator import Session
 from es_service.protocol.system import given_path
 from es_service.report.progress import in_notebook, show_in_notebook
 from es_service.runs import view
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, warn
-from es_service.runs.sessions import Listener, continue_run, create_run
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, warn
+from es_service.runs.sessions import Listener, continue_run, create_run, outcome_of
 from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
 from es_service.store.folder import CONFIG, holds_run
@@ -51,7 +52,6 @@ def _listener(
     on_compile: OnNotice,
     progress: bool,
     hook: Callable[[str], None] = no_hook,
-    caller: Caller | None = None,
 ) -> Listener:
     """What a session calls: with each history row `on_generation`, or if there is none, what shows the progress in a
     notebook."""
@@ -66,7 +66,7 @@ def _listener(
         else:
             yield lambda row: None
 
-    return Listener(shown, on_notice, on_compile, hook, caller)
+    return Listener(shown, on_notice, on_compile, hook)
 
 
 def run(
@@ -78,7 +78,6 @@ def run(
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
-    caller: Caller | None = None,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
 
@@ -94,20 +93,26 @@ def run(
             nothing.
         on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
-        caller: for `ask_tell`, which computes the episodes of a task that has none of its own.
 
     Raises:
         ConfigError: the config is wrong. StoreError: the folder cannot be used. EvaluationError: the rollouts cannot
             continue. Interrupted: SIGINT or SIGTERM arrived. Committed generations are safe in every case.
     """
     named = os.fspath(config) if isinstance(config, str | os.PathLike) else None
-    again = WayOut("run", "", config=named, out=_text(out))
     if not isinstance(config, RunConfig):
         config = load_config(config)
+    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    return outcome_of(_begin(config, out, named, listener))
+
+
+def _begin(
+    config: RunConfig, out: str | os.PathLike[str] | None, named: str | None, listener: Listener
+) -> Session[Outcome]:
+    """Start a run whose config was loaded from a file of this name."""
+    again = WayOut("run", "", config=named, out=_text(out))
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
-        parent, beginning = started(config, config.search.init_from, on_notice)
-    listener = _listener(on_generation, on_notice, on_compile, progress, hook, caller)
+        parent, beginning = started(config, config.search.init_from, listener.on_notice)
     return create_run(config, _folder(out, config), parent, beginning, again, listener)
 
 
@@ -142,7 +147,7 @@ def resume(
 
     overrides, asked = _with_values(overrides)
     listener = _listener(on_generation, on_notice, on_compile, progress, hook)
-    return continue_run(given_path(folder), changed, listener, asked, strict=strict)
+    return outcome_of(continue_run(given_path(folder), changed, listener, asked, strict=strict))
 
 
 def run_or_resume(
@@ -153,31 +158,21 @@ def run_or_resume(
     on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
-    caller: Caller | None = None,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
-
-    Args:
-        caller: as for `run`.
 
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
+    return outcome_of(begin_or_resume(config, out, _listener(on_generation, on_notice, on_compile, progress)))
+
+
+def begin_or_resume(config: RunConfig | Source, out: str | os.PathLike[str], listener: Listener) -> Session[Outcome]:
+    """The session of `run_or_resume`, and of `ask_tell`."""
     folder = given_path(out)
     begun = holds_run(folder)
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
-    if not begun:
-        return run(
-            wanted,
-            out,
-            on_generation=on_generation,
-            on_notice=on_notice,
-            progress=progress,
-            on_compile=on_compile,
-            caller=caller,
-        )
-    listener = _listener(on_generation, on_notice, on_compile, progress, caller=caller)
-    return continue_run(folder, lambda store: wanted, listener)
+    return continue_run(folder, lambda store: wanted, listener) if begun else _begin(wanted, out, None, listener)
 
 
 def fork(
@@ -213,7 +208,7 @@ def fork(
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
     listener = _listener(on_generation, on_notice, on_compile, progress, hook)
-    outcome = create_run(config, _folder(out, config), lineage, beginning, again, listener)
+    outcome = outcome_of(create_run(config, _folder(out, config), lineage, beginning, again, listener))
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "

@@ -1,7 +1,7 @@
 """Ask and tell: our method, map, store and reports, and the caller's episodes. The mirror image of `evaluator`.
 
-The run goes on in a thread of its own, in which the driver waits for the caller wherever it would otherwise wait for
-workers. Gradients are computed in that thread, since they need no episodes.
+The session of the run is a generator: what it yields are the chunks that workers would otherwise compute. Their rows
+are handed to the caller. Gradients are computed here, since they need no episodes.
 
 Axes: N rows, D policy parameters, O observation, A action, B descriptor dimensions.
 """
@@ -9,30 +9,29 @@ Axes: N rows, D policy parameters, O observation, A action, B descriptor dimensi
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, nullcontext, suppress
+from contextvars import copy_context
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from queue import Queue
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.api import run_or_resume
+from es_service.api import begin_or_resume
 from es_service.config.caller import CALLER
 from es_service.config.loading import Source
-from es_service.config.model import RunConfig
+from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
-from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.errors import ConfigError, EvaluationError, ForkedError
+from es_service.protocol.evaluator import Session
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
 from es_service.protocol.parent import require_same_process
 from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
-from es_service.runs.session import CallerLeft, OnNotice, Outcome, warn
+from es_service.runs.session import OnNotice, Outcome, warn
+from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
 from workers.asking import Rows, Told, gradients, results_of, rows_of
@@ -112,17 +111,24 @@ class Asked:
 class AskTell:
     """A run whose episodes the caller computes; `ask_tell` makes one. To be used from one thread."""
 
-    def __init__(self, folder: Path, dimensions: int) -> None:
-        """`dimensions`: those of the descriptor."""
+    def __init__(self, folder: Path, spec: WorkerSpec, dimensions: int, session: Session[Outcome]) -> None:
+        """Begin nothing yet.
+
+        Args:
+            dimensions: those of the descriptor.
+            session: of the run, whose work is the caller's.
+        """
         self.folder = folder
         self.outcome: Outcome | None = None
         """How the run ended; None while it goes on."""
-        self._from_run: Queue[Asked | Outcome | BaseException] = Queue()
-        self._to_run: Queue[Told | None] = Queue()
+        self._session, self._spec, self._dimensions = session, spec, dimensions
+        self._context, self._maker = copy_context(), os.getpid()  # the log's records of the caller are not the run's
+        self._work: Sequence[Work] = ()
         self._asked: Asked | None = None
+        self._last: Token | None = None
+        """Of what was asked last."""
         self._error: BaseException | None = None
         """What has ended the run before its budget was spent; raised again by every later call."""
-        self._dimensions, self._maker = dimensions, os.getpid()
 
     @property
     def run(self) -> Run:
@@ -136,7 +142,7 @@ class AskTell:
         """
         require_same_process(self._maker, "this ask_tell", "have that one tell what is computed here")
         if self._asked is None and self.outcome is None:
-            self._receive()
+            self._go_on()
         return self._asked
 
     def tell(
@@ -197,61 +203,43 @@ class AskTell:
                 raise ConfigError(f"moments must be {allowed}", field="moments", allowed=allowed)
             observed = Moments(number, mean_O, m2_O)
         self._asked = None
-        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed))
-        self._receive()
+        told = Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed)
+        self._go_on(results_of(self._spec, self._work, told))
 
-    def _receive(self) -> None:
-        """Wait until the run asks, or ends."""
+    def _go_on(self, results: list[ChunkResult] | None = None) -> None:
+        """Let the run go on until it asks, or ends. When it asks, the generation before has been committed."""
         if self._error is not None:
             raise self._error
-        match self._from_run.get():
-            case Asked() as asked:
-                self._asked = asked
-            case Outcome() as outcome:
-                self.outcome = outcome
-            case CallerLeft():
-                self._error = EvaluationError(LEFT)
-                raise self._error
-            case BaseException() as error:
-                self._error = error
-                raise error
-
-
-class _CallersEpisodes:
-    """Engine whose worker is the caller."""
-
-    platforms: frozenset[str] = frozenset()
-    counts = DispatchCounts(workers=1)
-
-    def __init__(self, spec: WorkerSpec, between: AskTell) -> None:
-        self._spec, self._between = spec, between
-        self._next = Token(between.run.meta.run_id, 0, 0)
-
-    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        """Ask the caller; gradients are computed here."""
-        if not work:
-            return []
-        if isinstance(work[0][1], GradientChunk):
-            return gradients(self._spec, work)
-        rows, between = rows_of(self._spec, work), self._between
+        try:
+            while True:
+                work = self._context.run(self._session.send, results)
+                assert work is not None
+                self._context.run(next, self._session)
+                if not isinstance(work[0][1], GradientChunk):
+                    break
+                results = gradients(self._spec, work)
+        except StopIteration as end:
+            self.outcome = end.value
+            return
+        except BaseException as error:
+            self._error = error
+            raise
+        rows, generation = rows_of(self._spec, work), work[0][1].generation
         shown = rows.parameters_N_D, rows.mean_N_O, rows.std_N_O, rows.seed_N, rows.is_noisy_N
         for array in shown:
             array.setflags(write=False)  # `ask` returns the same ones again
-        token, generation = self._next, work[0][1].generation
-        if generation != token.generation:
-            token = replace(token, generation=generation, request=0)
-        self._next = replace(token, request=token.request + 1)
-        between._from_run.put(Asked(token, *shown, rows, self._spec))
-        if (told := between._to_run.get()) is None:
-            raise CallerLeft
-        return results_of(self._spec, work, told)
+        last = self._last or Token(self.run.meta.run_id, generation, -1)
+        request = last.request + 1 if generation == last.generation else 0
+        self._last = Token(last.run, generation, request)
+        self._work, self._asked = work, Asked(self._last, *shown, rows, self._spec)
 
-    def wait_for_place(self) -> None:
-        """The caller is there."""
-
-    def last_loss(self, what: str = "") -> str:
-        """No worker is ever lost."""
-        return what
+    def _leave(self) -> None:
+        """End the session. In a process that was forked, the run goes on in the other one."""
+        self._asked = None
+        if self.outcome is None and self._error is None:
+            self._error = EvaluationError(LEFT)
+        with suppress(ForkedError):
+            self._context.run(self._session.close)
 
 
 @contextmanager
@@ -288,30 +276,16 @@ def ask_tell(
             value=wanted.task.environment,
             allowed=CALLER,
         )
-    search = AskTell(folder, len(task_of(wanted).descriptor_names))
-
-    @contextmanager
-    def caller(spec: WorkerSpec) -> Iterator[Any]:
-        yield _CallersEpisodes(spec, search)
-
-    def work() -> None:
-        try:
-            outcome = run_or_resume(wanted, folder, on_notice=on_notice, progress=False, caller=caller)
-            search._from_run.put(outcome)
-        except BaseException as error:  # also CallerLeft; the caller's thread raises it
-            search._from_run.put(error)
-
-    thread = threading.Thread(target=work, name=f"run in {folder}", daemon=True)
-    thread.start()
+    task = task_of(wanted)
+    listener = Listener(
+        lambda folder: nullcontext(lambda row: None), on_notice, lambda sentence: None, asks_caller=True
+    )
+    session = begin_or_resume(wanted, folder, listener)
+    search = AskTell(folder, worker_spec(wanted, task, asks_caller=True), len(task.descriptor_names), session)
     try:
         yield search
     finally:
-        search._asked = None
-        if os.getpid() == search._maker:  # else the run goes on in another process
-            search._to_run.put(None)
-            thread.join()
-        if search.outcome is None and search._error is None:  # what the run asked last may still be in the queue
-            search._error = EvaluationError(LEFT)
+        search._leave()
 
 
 def _require_same(asked: object, now: Token) -> None:

@@ -60,7 +60,17 @@ def chunk_runner(worker_spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResu
     return lambda centre, chunk: run([(centre, chunk)])[0]
 
 
-class DirectEvaluator:
+class AtTheEnd:
+    """Begins to compute work when somebody waits for it."""
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        return lambda: self.evaluate(work)
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        raise NotImplementedError
+
+
+class DirectEvaluator(AtTheEnd):
     """An Evaluator in this process: one worker function, chunks in the order given. Records all it returned."""
 
     def __init__(self, worker_spec: WorkerSpec) -> None:
@@ -74,7 +84,7 @@ class DirectEvaluator:
         return results
 
 
-class WorkerHere:
+class WorkerHere(AtTheEnd):
     """An engine whose one worker is the caller."""
 
     platforms: frozenset[str] = frozenset()

@@ -23,7 +23,7 @@ from es_service.loop.history import CORRECTED, HistoryRow, doubles
 from es_service.loop.interfaces import Search
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.loop.state import RunState
-from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.evaluator import Requests
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain
 from es_service.protocol.recipes import unvaried
@@ -44,10 +44,7 @@ class Correction:
     episodes: int = 0
 
 
-@np.errstate(invalid="ignore", over="ignore")  # an elite with an infinite fitness leaves
-def correct(
-    search: Search, evaluator: Evaluator, elites: Callable[[int], Elite], before: RunState, updated: Update
-) -> Correction:
+def correct(search: Search, elites: Callable[[int], Elite], before: RunState, updated: Update) -> Requests[Correction]:
     """The corrected columns of a generation; without values where it does not correct, and none if no generation does.
 
     Args:
@@ -68,13 +65,14 @@ def correct(
     for ask, first in enumerate(range(0, map_.size, ELITES_AT_ONCE)):
         cells = map_.cell_N[first : first + ELITES_AT_ONCE].tolist()
         kept = [new[cell] if cell in new else elites(_origin(before, map_, cell)) for cell in cells]
-        results = _episodes(search, evaluator, kept, generation, ask)
-        valid_N = np.asarray(valid_members(results).all(axis=1))
-        columns = (map_.centre_N[first : first + len(cells)][valid_N], np.full(int(valid_N.sum()), np.nan))
-        descriptor_N_B = doubles(results.descriptor).mean(axis=1)[valid_N]
-        if valid_N.any():
-            fitness_N = doubles(results.fitness).mean(axis=1)[valid_N]
-            again = insert_each(again, descriptor_N_B, fitness_N, generation, *columns)
+        results = yield from _episodes(search, kept, generation, ask)
+        with np.errstate(invalid="ignore", over="ignore"):  # an elite with an infinite fitness leaves
+            valid_N = np.asarray(valid_members(results).all(axis=1))
+            columns = (map_.centre_N[first : first + len(cells)][valid_N], np.full(int(valid_N.sum()), np.nan))
+            descriptor_N_B = doubles(results.descriptor).mean(axis=1)[valid_N]
+            if valid_N.any():
+                fitness_N = doubles(results.fitness).mean(axis=1)[valid_N]
+                again = insert_each(again, descriptor_N_B, fitness_N, generation, *columns)
         steps, episodes = steps + steps_of(results), episodes + results.fitness.size
     statistics = map_statistics(again, settings.qd_offset, None)
     values = statistics["coverage"], statistics["qd_score"], statistics["map_fitness_max"]
@@ -91,7 +89,7 @@ def _origin(before: RunState, map_: BehaviourMap, cell: int) -> int:
     return origin
 
 
-def _episodes(search: Search, evaluator: Evaluator, elites: list[Elite], generation: int, ask: int) -> EpisodesResult:
+def _episodes(search: Search, elites: list[Elite], generation: int, ask: int) -> Requests[EpisodesResult]:
     """Results of some elites' episodes, [N, E]."""
     statistics: list[NDArray[np.float32]] = [
         np.stack([getattr(elite, name) for elite in elites]) for name in ("observation_mean_O", "observation_std_O")
@@ -105,5 +103,5 @@ def _episodes(search: Search, evaluator: Evaluator, elites: list[Elite], generat
         ask=ask,
         domain=Domain.CORRECTION_RESET,
     )
-    results = evaluator.evaluate(work.work)
+    results = yield work.work
     return policy_episodes(work, [result for result in results if isinstance(result, EpisodesResult)])

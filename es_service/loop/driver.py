@@ -1,16 +1,18 @@
 """The main loop of a run. A generation is: propose, evaluate, update, finish.
 
 The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. A
-generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed.
+generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed. It is a
+generator: `results = yield work`. Whoever drives it computes the work, or has it computed.
 Generation 0 proposes the initial centres, without populations around them, so that it has no gradient and takes no
 step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +41,7 @@ from es_service.loop.evaluated import (
     policies_asked,
     told_of,
 )
-from es_service.loop.finished import Finished, finish, rows
+from es_service.loop.finished import Finished, finish, reachable_in, rows
 from es_service.loop.generation import (
     estimate_gradients,
     evaluate_centres,
@@ -54,22 +56,22 @@ from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, state_from_parts
 from es_service.loop.policies import as_population
 from es_service.loop.state import RunState
-from es_service.protocol.evaluator import DispatchCounts, Evaluator
+from es_service.protocol.evaluator import DispatchCounts, Evaluator, Requests, Session, Value
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
 from es_service.search.algorithms.base import Ask, SearchState
-from es_service.search.maps.geometry import reachable_cells
 from es_service.search.novelty import novelty
 
 
 def run(
     search: Search,
-    evaluator: Evaluator,
     store: Store,
     state: RunState | None,
     report: Callable[[HistoryRow], object],
     failed: Callable[[Sequence[str]], object] = lambda failures: None,
-) -> tuple[RunState, str]:
-    """Run generations until the budget is spent or `report` returns a `Stop`.
+    counts: Callable[[], DispatchCounts] = DispatchCounts,
+) -> Session[tuple[RunState, str]]:
+    """Run generations until the budget is spent or `report` returns a `Stop`. While the rollouts of one are computed,
+    the one before is stored.
 
     Args:
         state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
@@ -77,24 +79,25 @@ def run(
             any other value has no effect.
         failed: called before that with texts that name the generation's failed episodes, if there are any of which
             the rollouts know more.
+        counts: returns the numbers of workers and of faults so far.
 
     Returns:
         The last state and the reason for ending, in words.
 
     Raises:
         EvaluationError, StoreError: the run cannot continue; nothing committed is lost.
-        Interrupted: a signal asked the run to stop.
     """
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
     state = state or initial_state(search)
-    reachable = None if state.search.map is None else reachable_cells(state.search.map.geometry, search.task)
+    reachable = reachable_in(search, state)
     elites = Elites(store.part)
     finished: list[Finished] = []
 
-    def record() -> None:
-        """Store and report the generation that is finished, if there is one that is not stored. Raises _Stopped."""
+    def record() -> str | None:
+        """Store and report the generation that is finished, if there is one that is not stored. Returns the reason to
+        stop, if there is one."""
         if not finished:
-            return
+            return None
         clock.lap("seconds_rollout")  # of the next generation, whose work has been sent
         newest = finished.pop()
         if newest.failures:
@@ -106,26 +109,46 @@ def run(
         clock.lap("seconds_store")
         answer = report(row)
         clock.lap("seconds_driver")
-        if isinstance(answer, Stop):
-            raise _Stopped(answer.reason)
+        return answer.reason if isinstance(answer, Stop) else None
 
-    try:
-        while (reason := spent(search.config.budget, state)) is None:
+    while (reason := spent(search.config.budget, state)) is None:
+        requests = generation(search, elites, store.part, clock, state, counts)
+        results: Any = None
+        try:
+            while True:
+                try:
+                    work = requests.send(results)
+                except StopIteration as end:
+                    finished.append(end.value)
+                    break
+                yield work
+                if (reason := record()) is not None:
+                    return state, reason
+                results = yield None
+        except BaseException:
+            record()  # if this generation has failed before it was sent
+            raise
+        state = finished[0].state
+    return state, record() or reason
+
+
+def drive(session: Session[Value], evaluator: Evaluator) -> Value:
+    """What a session returns, whose work an evaluator computes.
+
+    Raises:
+        EvaluationError: the work cannot be computed. Interrupted: a signal asked the run to stop.
+    """
+    with closing(session):
+        results: Any = None
+        while True:
             try:
-                finished.append(_generation(search, evaluator, store, elites, clock, state, record))
-            except BaseException:
-                with suppress(_Stopped):  # or a stop would hide why this generation failed
-                    record()  # if it has failed before it was sent
-                raise
-            state = finished[0].state
-        record()
-    except _Stopped as stopped:
-        reason = stopped.args[0]
-    return state, reason
-
-
-class _Stopped(Exception):  # noqa: N818 (ends the loop)
-    """`report` has returned a `Stop`, whose reason is the argument."""
+                work = session.send(results)
+                assert work is not None
+                wait = evaluator.begin(work)
+                next(session)
+            except StopIteration as end:
+                return end.value
+            results = wait()
 
 
 def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
@@ -158,38 +181,41 @@ def _reached(state: RunState) -> dict[str, float]:
     }
 
 
-def _generation(
+def generation(
     search: Search,
-    evaluator: Evaluator,
-    store: Store,
     elites: Elites,
+    stored: Callable[[str], Mapping[str, np.ndarray]],
     clock: Clock,
     state: RunState,
-    record: Callable[[], object],
-) -> Finished:
-    """One generation: a pure function of (search, state, elites) but for its timings.
+    counts: Callable[[], DispatchCounts] = DispatchCounts,
+) -> Requests[Finished]:
+    """One generation, which asks for what it needs computed: a pure function of (search, state, elites, results) but
+    for its timings.
 
-    It may ask for several populations, and for policies. Each step computes all of them side by side; results are taken
+    It may ask for several populations, and for policies. Each request has all of them side by side; results are taken
     in ask order.
 
     Args:
-        record: stores the generation before; called as soon as work has been sent.
+        elites, stored: the policies of the map and the parts of `state`, as they are stored.
+        state: the state before it.
+        counts: as in `run`.
     """
-    since = evaluator.counts if state.generation >= 0 else DispatchCounts()
+    since = counts() if state.generation >= 0 else DispatchCounts()
     proposal = propose(search, elites, state)
     clock.lap("seconds_driver")
-    evaluations = evaluate(search, evaluator, proposal, clock, record)
-    updated = update(search, evaluator, proposal, evaluations, clock)
+    evaluations = yield from evaluate(search, proposal)
+    clock.lap("seconds_rollout")
+    updated = yield from update(search, proposal, evaluations, clock)
     clock.lap("seconds_driver")
-    correction = correct(search, evaluator, elites, state, updated)
+    correction = yield from correct(search, elites, state, updated)
     clock.lap("seconds_evaluation")
-    now = evaluator.counts
+    now = counts()
     faults: HistoryRow = {
         "retries": now.retries - since.retries,
         "lost_workers": now.lost_workers - since.lost_workers,
         "workers": now.workers,
     }
-    finished = finish(state, proposal, evaluations, updated, correction, faults, store.part, search, clock)
+    finished = finish(state, proposal, evaluations, updated, correction, faults, stored, search, clock)
     elites.change(finished.parts)
     return finished
 
@@ -218,32 +244,28 @@ def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
     return Proposal(generation, begun, start_cells, asked, points, policies)
 
 
-def evaluate(
-    search: Search, evaluator: Evaluator, proposal: Proposal, clock: Clock, record: Callable[[], object]
-) -> Evaluations:
-    """Roll out the populations and the policies; meanwhile, `record` is called."""
+def evaluate(search: Search, proposal: Proposal) -> Requests[Evaluations]:
+    """Roll out the populations and the policies."""
     config, asks = search.config, proposal.asks
     if not proposal.asked:
-        record()
         return Evaluations((), (), (), ())
     pairs = [ask.pairs for ask in asks]
-    populations, observed, policies = evaluate_populations(
-        evaluator, proposal.centres, pairs, config.compute.chunk_pairs, proposal.policies, record
+    populations, observed, policies = yield from evaluate_populations(
+        proposal.centres, pairs, config.compute.chunk_pairs, proposal.policies
     )
-    clock.lap("seconds_rollout")
     members = [*populations, *map(as_population, policies)]
     members, infeasible = invalidate(members, config.search, proposal.generation)
     return Evaluations(members[: len(asks)], policies, members, observed, infeasible)
 
 
-def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations: Evaluations, clock: Clock) -> Update:
+def update(search: Search, proposal: Proposal, evaluations: Evaluations, clock: Clock) -> Requests[Update]:
     """Weigh the noise, estimate gradients, step, evaluate the new centres, and tell the search."""
     config, algorithm, generation = search.config, search.algorithm, proposal.generation
     stepped, new_centres = proposal.search, proposal.centres
     if proposal.asked:
-        stepped, new_centres = _step(search, evaluator, proposal, evaluations.populations, clock)
+        stepped, new_centres = yield from _step(search, proposal, evaluations.populations, clock)
     resets = "by_ask" if proposal.asked else "by_chunk"
-    results = evaluate_centres(evaluator, new_centres, config.search.evaluation_episodes, resets=resets)
+    results = yield from evaluate_centres(new_centres, config.search.evaluation_episodes, resets=resets)
     clock.lap("seconds_evaluation")
     if not proposal.asked:
         allow_infeasible = config.search.allow_infeasible
@@ -267,8 +289,8 @@ def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations
 
 
 def _step(
-    search: Search, evaluator: Evaluator, proposal: Proposal, populations: Sequence[EpisodesResult], clock: Clock
-) -> tuple[SearchState, list[Centre]]:
+    search: Search, proposal: Proposal, populations: Sequence[EpisodesResult], clock: Clock
+) -> Requests[tuple[SearchState, list[Centre]]]:
     """The state after the step of each centre, and the new centres as they are sent to the workers."""
     config, algorithm, generation, asks = search.config, search.algorithm, proposal.generation, proposal.asks
     weights: list[FloatArray] = []
@@ -278,10 +300,10 @@ def _step(
     clock.lap("seconds_driver")
     block_pairs = config.compute.gradient_block_pairs
     if isinstance(config.search, PopulationConfig) and config.search.step_gate:
-        gradients, agreements = halves(evaluator, generation, weights, block_pairs)
+        gradients, agreements = yield from halves(generation, weights, block_pairs)
         asks = [replace(ask, rate=ask.rate * agreement) for ask, agreement in zip(asks, agreements, strict=True)]
     else:
-        gradients = estimate_gradients(evaluator, generation, weights, block_pairs)
+        gradients = yield from estimate_gradients(generation, weights, block_pairs)
     clock.lap("seconds_gradient")
     stepped = proposal.search
     for ask, gradient_D in zip(asks, gradients, strict=True):

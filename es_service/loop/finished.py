@@ -25,6 +25,7 @@ from es_service.loop.interfaces import Search
 from es_service.loop.parts import Changes
 from es_service.loop.state import RunState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
+from es_service.search.maps.geometry import reachable_cells
 from es_service.search.observation_statistics import merge_moments
 from es_service.search.steps.clipup import norm
 
@@ -57,6 +58,11 @@ class Finished:
         """Texts that name its failed episodes, as far as the rollouts know more of them."""
         results = [*self.evaluations.members, self.updated.evaluated.evaluation]  # policies are in both
         return list(dict.fromkeys(text for result in results for text in result.failures))
+
+
+def reachable_in(search: Search, state: RunState) -> Reachable:
+    """The cells of a run's map that can be reached."""
+    return None if state.search.map is None else reachable_cells(state.search.map.geometry, search.task)
 
 
 def finish(

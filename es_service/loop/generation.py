@@ -22,7 +22,7 @@ from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, RunState, statistics_in_force
 from es_service.protocol.episodes import joined
-from es_service.protocol.evaluator import Evaluator, evaluate_beside
+from es_service.protocol.evaluator import Requests
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
@@ -90,17 +90,12 @@ def make_centre(
 
 
 def evaluate_populations(
-    evaluator: Evaluator,
     centres: Sequence[Centre],
     pairs: Sequence[int],
     chunk_pairs: int,
     policies: Sequence[PolicyWork] = (),
-    meanwhile: Callable[[], object] = lambda: None,
-) -> tuple[list[EpisodesResult], list[Moments], list[EpisodesResult]]:
+) -> Requests[tuple[list[EpisodesResult], list[Moments], list[EpisodesResult]]]:
     """Roll out each centre's number of pairs around it, and side by side with them policies.
-
-    Args:
-        meanwhile: see `evaluate_beside`.
 
     Returns:
         The results of each population, with axes [P, S]; the observation moments in the order of the populations and,
@@ -112,7 +107,7 @@ def evaluate_populations(
         )
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
-    answers = _evaluate(EpisodesResult, evaluator, [*asked, *(policy_work.work for policy_work in policies)], meanwhile)
+    answers = yield from _evaluate(EpisodesResult, [*asked, *(policy_work.work for policy_work in policies)])
     trained, of_policies = answers[: len(asked)], answers[len(asked) :]
     moments = [result.moments for results in trained for result in results if result.moments is not None]
     return (
@@ -123,13 +118,12 @@ def evaluate_populations(
 
 
 def evaluate_centres(
-    evaluator: Evaluator,
     centres: Sequence[Centre],
     episodes: int,
     *,
     resets: Literal["by_ask", "by_chunk", "same"] = "by_ask",
     first: int = 0,
-) -> list[EpisodesResult]:
+) -> Requests[list[EpisodesResult]]:
     """Roll out each unperturbed centre: results with axis [E].
 
     Args:
@@ -143,7 +137,7 @@ def evaluate_centres(
         if resets == "by_chunk":
             start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
         asked.append(with_subject(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
-    answers = _evaluate(EpisodesResult, evaluator, asked)
+    answers = yield from _evaluate(EpisodesResult, asked)
     return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in answers]
 
 
@@ -152,9 +146,7 @@ def first_episode(centre: int, episodes: int) -> int:
     return centre * -(-episodes // EVALUATION_EPISODES_PER_CHUNK) * EVALUATION_EPISODES_PER_CHUNK
 
 
-def estimate_gradients(
-    evaluator: Evaluator, generation: int, weights: Sequence[FloatArray], block_pairs: int
-) -> list[FloatArray]:
+def estimate_gradients(generation: int, weights: Sequence[FloatArray], block_pairs: int) -> Requests[list[FloatArray]]:
     """Gradient estimate [D] of each population: (1 / pairs) * sum over pairs of weight * standard normal noise.
 
     Workers need no centre for this.
@@ -171,7 +163,7 @@ def estimate_gradients(
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
             chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
         asked.append(with_subject(NO_CENTRE, chunks))
-    answers = _evaluate(GradientResult, evaluator, asked)
+    answers = yield from _evaluate(GradientResult, asked)
     return [
         tree_sum(results) * np.float32(1.0 / weights_P.size)
         for results, weights_P in zip(answers, weights, strict=True)
@@ -179,8 +171,8 @@ def estimate_gradients(
 
 
 def halves(
-    evaluator: Evaluator, generation: int, weights: Sequence[FloatArray], block_pairs: int
-) -> tuple[list[FloatArray], list[float]]:
+    generation: int, weights: Sequence[FloatArray], block_pairs: int
+) -> Requests[tuple[list[FloatArray], list[float]]]:
     """As `estimate_gradients`, and how well the two halves of each population agree, from 0 to 1.
 
     Each half's estimate is from its own pairs; the agreement is the cosine between them, or 0 if that is negative or
@@ -192,7 +184,7 @@ def halves(
             np.where((np.arange(weights_P.size) < weights_P.size // 2) == is_first, weights_P, np.float32(0.0))
             for weights_P in weights
         ]
-        parts.append(estimate_gradients(evaluator, generation, half, block_pairs))
+        parts.append((yield from estimate_gradients(generation, half, block_pairs)))
     pairs = list(zip(*parts, strict=True))
     return [first_D + second_D for first_D, second_D in pairs], [_agreement(*pair) for pair in pairs]
 
@@ -203,15 +195,11 @@ def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
     return max(0.0, both / length) if length > 0.0 else 0.0
 
 
-def _evaluate(
-    kind: type[Result],
-    evaluator: Evaluator,
-    asked: Sequence[Sequence[Work]],
-    meanwhile: Callable[[], object] | None = None,
-) -> list[list[Result]]:
+def _evaluate(kind: type[Result], asked: Sequence[Sequence[Work]]) -> Requests[list[list[Result]]]:
     """The results of each ask's chunks; all are computed side by side."""
-    work = [subject_chunk for of_ask in asked for subject_chunk in of_ask]
-    results = evaluator.evaluate(work) if meanwhile is None else evaluate_beside(evaluator, work, meanwhile)
+    if not (work := [subject_chunk for of_ask in asked for subject_chunk in of_ask]):
+        return []
+    results = yield work
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     remaining = iter(checked)

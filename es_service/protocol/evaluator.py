@@ -1,12 +1,25 @@
-"""The interface by which the driver has chunks run; engines implement it."""
+"""Requests: generators that yield work and receive its results, and the interface of what computes it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar
 
 from es_service.protocol.messages import ChunkResult, Work
+
+Value = TypeVar("Value")
+Evaluate = Callable[[Sequence[Work]], list[ChunkResult]]
+"""Function from chunks to their results, in the order of the chunks."""
+Requests = Generator[Sequence[Work], list[ChunkResult], Value]
+"""Yields chunks, each time receives their results in the order of the chunks, and returns what it makes of them.
+
+Whoever drives it decides where the chunks are computed: an engine, the caller of `ask_tell`, or a test with a list.
+"""
+
+Session = Generator[Sequence[Work] | None, list[ChunkResult] | None, Value]
+"""As `Requests`, but in two steps, so that the driver need not wait: it yields chunks to be sent, stores the generation
+before once it is resumed, yields None, and receives the results."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +36,15 @@ class DispatchCounts:
 
 
 class Evaluator(Protocol):
-    """Interface by which the driver has chunks run. Results do not depend on where, in what order or how often."""
+    """Interface of what computes chunks. Results do not depend on where, in what order or how often."""
 
     @property
     def counts(self) -> DispatchCounts:
         """Numbers of workers and of faults so far."""
+        ...
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        """Have chunks run, and return the function that waits for their results, which `evaluate` returns."""
         ...
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
@@ -40,20 +57,12 @@ class Evaluator(Protocol):
         ...
 
 
-@runtime_checkable
-class Beginning(Protocol):
-    """Interface of an evaluator that computes while the driver does something else."""
-
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
-        """Have chunks run, and return the function that waits for their results, with what `evaluate` returns."""
-        ...
-
-
-def evaluate_beside(evaluator: Evaluator, work: Sequence[Work], meanwhile: Callable[[], object]) -> list[ChunkResult]:
-    """`evaluator.evaluate(work)`, and something that the driver does meanwhile, or before if that is not possible."""
-    if isinstance(evaluator, Beginning):
-        wait = evaluator.begin(work)
-        meanwhile()
-        return wait()
-    meanwhile()
-    return evaluator.evaluate(work)
+def completed(requests: Requests[Value], evaluate: Evaluate) -> Value:
+    """What a generator of work returns, all of whose work is computed by one function."""
+    results: Any = None
+    while True:
+        try:
+            work = requests.send(results)
+        except StopIteration as end:
+            return end.value
+        results = evaluate(work)

@@ -22,7 +22,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
-from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
 from es_service.runs.compiling import compiling_sentence, noting
@@ -243,7 +243,7 @@ def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list
     totals: list[_Totals] = []
     for start in range(0, episodes, EPISODES_AT_ONCE):
         count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
-        results = evaluate_centres(engine, centres, count, resets="same", first=first)
+        results = completed(evaluate_centres(centres, count, resets="same", first=first), engine.evaluate)
         parts = [
             (moments_of(result.fitness), moments_of(result.descriptor), int(np.sum(result.outputs.get("success", 0))))
             for result in results

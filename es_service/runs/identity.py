@@ -99,7 +99,7 @@ class Recorder:
     def __init__(
         self,
         store: RunStore,
-        engine: Engine[Any],
+        engine: Engine[Any] | None,
         platform: Mapping[str, Any],
         code: Sources,
         on_notice: Callable[[str], None],
@@ -109,7 +109,7 @@ class Recorder:
         """Record in a store.
 
         Args:
-            engine: the engine, which knows the platforms of its workers.
+            engine: the engine, which knows the platforms of its workers; None: the caller computes the episodes.
             platform: `platform_info` of this driver.
             code: `code_of` the run.
             strict: whether workers on another platform are an error instead of a notice.
@@ -120,7 +120,7 @@ class Recorder:
 
     def workers(self) -> frozenset[str]:
         """Platforms of the workers that there are now."""
-        return self._engine.platforms
+        return frozenset() if self._engine is None else self._engine.platforms
 
     def commit(
         self, workers: frozenset[str], generation: int, parts: Changes, history: HistoryRow, evaluations: Table

@@ -6,7 +6,8 @@ import pickle
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import cycle, islice
@@ -27,7 +28,6 @@ from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
-from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
@@ -251,39 +251,6 @@ def _message_costs(
     return message_s, way_s, chunk_message_s
 
 
-class _Replay:
-    """Evaluator that answers each chunk at once with the recorded result of its kind, but with other descriptors.
-
-    The novelty of equal descriptors takes many times longer. The descriptors are therefore those of a search that has
-    been everywhere: a place for each answer, and a scatter around it.
-    """
-
-    counts = DispatchCounts(workers=1)
-
-    def __init__(self, answers: Mapping[str, ChunkResult], random: np.random.Generator, bounds_B_2: np.ndarray) -> None:
-        self.beside_s = self.replay_s = 0.0
-        """Time so far of what the driver does while rollouts compute, and of this evaluator itself."""
-        self._answers = {
-            kind: cycle([_moved(answer, random, bounds_B_2) for _ in range(REPLAYED)])
-            for kind, answer in answers.items()
-        }
-
-    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        began = time.perf_counter()
-        results = [_of_slots(next(self._answers[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work]
-        self.replay_s += time.perf_counter() - began
-        return results
-
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
-        began = time.perf_counter()
-
-        def wait() -> list[ChunkResult]:
-            self.beside_s += time.perf_counter() - began
-            return self.evaluate(work)
-
-        return wait
-
-
 def _of_slots(answer: ChunkResult, subject: Subject, chunk: Chunk) -> ChunkResult:
     """The recorded answer for a chunk of policies that may have fewer slots, and traces only of first episodes."""
     if not (isinstance(answer, EpisodesResult) and isinstance(subject, Policies) and isinstance(chunk, PolicyChunk)):
@@ -351,19 +318,33 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
         columns=history,
         evaluation_columns=evaluations,
     )
-    replay, times = _Replay(answers, random, bounds_B_2), list[tuple[float, float]]()
-
-    def ended(_: object) -> None:
-        passed_s = time.perf_counter() - replay.beside_s - replay.replay_s
-        times.append((passed_s, replay.beside_s))
+    # The novelty of equal descriptors takes many times longer. They are therefore those of a search that has been
+    # everywhere: a place for each answer, and a scatter around it.
+    replayed = {
+        kind: cycle([_moved(answer, random, bounds_B_2) for _ in range(REPLAYED)]) for kind, answer in answers.items()
+    }
+    driver_s = beside_s = 0.0
+    times: list[tuple[float, float]] = []
 
     with (
         tempfile.TemporaryDirectory() as folder,
         RunStore.create(Path(folder) / "run", config.resolved_yaml(), meta, Beginning()) as store,
     ):
-        driver.run(search, replay, store, None, ended)
-    driver_s, beside_s = np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0)
-    return float(driver_s), float(beside_s)
+        session = driver.run(search, store, None, lambda _: times.append((driver_s, beside_s)))
+        results: Any = None
+        with suppress(StopIteration):
+            while True:
+                began = time.perf_counter()
+                work = session.send(results)
+                sent = time.perf_counter()
+                driver_s += sent - began
+                next(session)
+                beside_s += time.perf_counter() - sent
+                results = [
+                    _of_slots(next(replayed[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work or ()
+                ]
+    driver_s, beside_s = map(float, np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0))
+    return driver_s, beside_s
 
 
 def _budget() -> dict[str, Any]:

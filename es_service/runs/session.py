@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,8 +23,9 @@ from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.history import evaluated_word
 from es_service.loop.parts import moments_from_arrays
+from es_service.protocol.evaluator import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
-from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
+from es_service.protocol.messages import FloatArray, Moments
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.compiling import compiling_sentence, noting
@@ -57,10 +58,6 @@ OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
 
-Caller = Callable[[WorkerSpec], AbstractContextManager[Any]]
-"""Makes an `Engine` that has the caller compute the episodes of a task that has none of its own."""
-
-
 def warn(notice: str) -> None:
     """Show a notice as a RuntimeWarning; the default for `on_notice`."""
     warnings.warn(notice, RuntimeWarning, stacklevel=2)
@@ -86,15 +83,16 @@ def work(
     on_compile: OnNotice,
     *,
     strict: bool = False,
-    caller: Caller | None = None,
-) -> Outcome:
-    """Run generations until the budget is spent or `on_generation` returns a `Stop`.
+    asks_caller: bool = False,
+) -> Session[Outcome]:
+    """Run generations until the budget is spent or `on_generation` returns a `Stop`. The configured engine computes
+    their work, so that nothing is yielded, unless the caller does.
 
     Args:
         on_compile: called with a sentence when workers compile, or make or reset environments, for some time, and
             before centroids are placed for some time.
         strict: whether workers on another platform than the run's are an error.
-        caller: what computes the episodes instead of the configured engine, if the task has none of its own.
+        asks_caller: whether work is yielded, because the task has no episodes of its own.
     """
     task = task_of(config)
     store.keep_every = config.store.keep_every
@@ -147,19 +145,19 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, spec = config.compute, worker_spec(config, task, asks_caller=caller is not None)
+    compute, spec = config.compute, worker_spec(config, task, asks_caller=asks_caller)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     with (
         _noting_the_end(store.lock),
-        _naming_the_run(store, "resume" if caller is None else "ask_tell"),
+        _naming_the_run(store, "ask_tell" if asks_caller else "resume"),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
-        stop_on_signals() as should_stop,
-        make_engine(
+        nullcontext(lambda: None) if asks_caller else stop_on_signals() as should_stop,
+        nullcontext()
+        if asks_caller
+        else make_engine(
             config, should_stop, noting(log, spec) if compute.address is None else log, tell_wait, tell, tell_compiling
-        )
-        if caller is None
-        else caller(spec) as engine,
+        ) as engine,
     ):
 
         def tell_failed(failures: Sequence[str]) -> None:
@@ -175,7 +173,7 @@ def work(
 
         def after_generation(row: Mapping[str, Any]) -> object:
             tell_notices()
-            if lost := row["lost_workers"]:
+            if engine is not None and (lost := row["lost_workers"]):
                 who = "a worker" if lost == 1 else counted(lost, "worker")
                 tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
             answer = on_generation(row)
@@ -190,15 +188,18 @@ def work(
             in_generation(row["generation"] + 1)
             return answer
 
-        if caller is None and compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
-            tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
-        engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
+        if engine is not None:
+            if compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
+                tell(f"compute.workers: {count} of {compute.workers} start, since {parallel_sentence(config)}")
+            engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
         if state is None and (placing := _placing_sentence(config.map)):
             _LOG.info(placing)
             on_compile(placing)
         with patient_store(store, recorder, should_stop, tell, lambda stored: log(Committed(stored))) as kept:
-            state, reason = driver.run(search, engine, kept, state, after_generation, tell_failed)
+            counts = (lambda: DispatchCounts(workers=1)) if engine is None else lambda: engine.counts
+            session = driver.run(search, kept, state, after_generation, tell_failed, counts)
+            state, reason = (yield from session) if engine is None else driver.drive(session, engine)
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)
     return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))
@@ -214,10 +215,6 @@ def _placing_sentence(config: MapConfig) -> str:
     return f"placing the centroids of the map ({about})" if seconds >= LONG_PLACING_S else ""
 
 
-class CallerLeft(BaseException):
-    """The caller who computes the episodes has left the block of `ask_tell`; raised in the thread of the run."""
-
-
 @contextmanager
 def _noting_the_end(lock: RunLock) -> Iterator[None]:
     """Keep what ends a session, for whoever asks later why the run stands still."""
@@ -230,7 +227,7 @@ def _noting_the_end(lock: RunLock) -> Iterator[None]:
         code = "" if stop.code is None else repr(stop.code)
         lock.note_end(f"the program that ran it has ended it with sys.exit({code}), as tuners end their trials")
         raise
-    except CallerLeft:
+    except GeneratorExit:
         lock.note_end("its caller has left the block of ask_tell")
         raise
     except ServiceError as error:

@@ -18,12 +18,13 @@ from es_service.config.tasks import task_of
 from es_service.dispatch import dispatch_log
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
+from es_service.protocol.evaluator import Session
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs import targets
 from es_service.runs.certified import target_reached
 from es_service.runs.checked_config import accepted
 from es_service.runs.resume_checks import columns, require_resumable
-from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, work
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free
 from es_service.runs.worker_count import require_cores
@@ -43,7 +44,8 @@ class Listener:
     on_notice: OnNotice
     on_compile: OnNotice
     hook: Callable[[str], None] = no_hook
-    caller: Caller | None = None
+    asks_caller: bool = False
+    """Whether the caller computes the episodes, to whom the sessions yield their work."""
 
 
 def create_run(
@@ -53,8 +55,8 @@ def create_run(
     beginning: Beginning,
     again: WayOut,
     listener: Listener,
-) -> Outcome:
-    """Create a run and work on it. If its workers cannot be started, there is no run afterwards.
+) -> Session[Outcome]:
+    """Create a run and work on it; yields as `session.work`. If no worker can be started, there is no run afterwards.
 
     Args:
         again: the call that was made, which ways out repeat with other settings.
@@ -62,7 +64,7 @@ def create_run(
     require_no_import_of_a_task()
     require_cores(config, again)
     is_new, task = not folder.exists(), task_of(accepted(config))
-    require_episodes(task, asks_caller=listener.caller is not None)
+    require_episodes(task, asks_caller=listener.asks_caller)
     history, evaluations = columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
@@ -82,7 +84,8 @@ def create_run(
         begun = store.generation
         try:
             until = targets.until_due(on_generation, targets.due(folder, config))
-            outcome = work(config, store, until, listener.on_notice, listener.on_compile, caller=listener.caller)
+            told = listener.on_notice, listener.on_compile
+            outcome = yield from work(config, store, until, *told, asks_caller=listener.asks_caller)
         except StartError as error:
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations
@@ -96,7 +99,7 @@ def create_run(
                 if way.action != "resume" or way.settings
             )
             raise
-    return _to_target(config, outcome, listener)
+    return (yield from _to_target(config, outcome, listener))
 
 
 def continue_run(
@@ -106,22 +109,31 @@ def continue_run(
     asked: Mapping[str, Any] = MappingProxyType({}),
     *,
     strict: bool = False,
-) -> Outcome:
-    """Continue a run, in as many sessions as `budget.target_certified` makes of it.
+) -> Session[Outcome]:
+    """Continue a run, in as many sessions as `budget.target_certified` makes of it; yields as `session.work`.
 
     Args:
         asked: settings of the call, which ways out repeat.
     """
-    config, outcome = _session(folder, make_config, listener, asked, strict=strict)
-    return _to_target(config, outcome, listener, strict=strict)
+    config, outcome = yield from _session(folder, make_config, listener, asked, strict=strict)
+    return (yield from _to_target(config, outcome, listener, strict=strict))
 
 
-def _to_target(config: RunConfig, outcome: Outcome, listener: Listener, *, strict: bool = False) -> Outcome:
+def outcome_of(session: Session[Outcome]) -> Outcome:
+    """What a session returns, for which an engine computes."""
+    try:
+        next(session)
+    except StopIteration as end:
+        return end.value
+    raise AssertionError("a session with an engine has asked its caller")
+
+
+def _to_target(config: RunConfig, outcome: Outcome, listener: Listener, *, strict: bool = False) -> Session[Outcome]:
     """Certify the best centre whenever a session has ended for that, and continue: if it reaches the target, no longer
     than until the next session has opened the run."""
     while outcome.reason == targets.TO_CERTIFY:
         targets.certify_best(outcome.run.folder, config, listener.on_notice)
-        _, outcome = _session(outcome.run.folder, lambda store: config, listener, strict=strict)
+        _, outcome = yield from _session(outcome.run.folder, lambda store: config, listener, strict=strict)
     return outcome
 
 
@@ -132,7 +144,7 @@ def _session(
     asked: Mapping[str, Any] = MappingProxyType({}),
     *,
     strict: bool = False,
-) -> tuple[RunConfig, Outcome]:
+) -> Session[tuple[RunConfig, Outcome]]:
     """Open a run, check that the config of this session fits it, and work on it."""
     opened = when_free(partial(RunStore.open, folder, hook=listener.hook), telling_once(folder, listener.on_notice))
     with opened as store, in_run(store.meta.run_id):
@@ -141,7 +153,7 @@ def _session(
             listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
-        require_episodes(task_of(config), asks_caller=listener.caller is not None)
+        require_episodes(task_of(config), asks_caller=listener.asks_caller)
         require_resumable(store, config, asked, strict=strict)
         try:
             write_config(folder, config.resolved_yaml())
@@ -154,4 +166,5 @@ def _session(
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, is_due)
             told = listener.on_notice, listener.on_compile
-            return config, work(config, store, until, *told, strict=strict, caller=listener.caller)
+            outcome = yield from work(config, store, until, *told, strict=strict, asks_caller=listener.asks_caller)
+            return config, outcome

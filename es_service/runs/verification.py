@@ -7,18 +7,21 @@ state is not kept: a kept state is only needed as a beginning.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-from es_service.config.model import BudgetConfig, worker_spec
+from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop import driver
+from es_service.loop.clock import Clock
+from es_service.loop.elites import Elites
+from es_service.loop.finished import reachable_in, rows
+from es_service.loop.generation import initial_state
 from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
-from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.checked_config import changed_config
 from es_service.runs.identity import changes_since, code_of
@@ -87,9 +90,7 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
         ) as engine,
     ):
         for begin, last in plan:
-            budget = BudgetConfig.model_validate({"generations": max(1, last)})  # or the next rollouts would begin
-            part = replace(search, config=config.model_copy(update={"budget": budget}))
-            reached, differences = _recompute(run, part, engine, begin, last)
+            reached, differences = _recompute(run, search, engine, begin, last)
             then = next((platform for first, platform in reversed(platforms) if first <= reached), {})
             now = {**platform_info(), CODE: code}
             yield Recomputed(0 if begin is None else begin + 1, reached, differences, tuple(changes_since(then, now)))
@@ -117,25 +118,25 @@ def _recompute(
     run: Run, search: driver.Search, evaluator: Evaluator, begin: int | None, last: int
 ) -> tuple[int, tuple[str, ...]]:
     """The generation that was reached, and what differs in it."""
-    store = _Comparison(run, begin, last)
-    state = driver.stored_state(store, search.task)
-    with suppress(_End):
-        driver.run(search, evaluator, store, state, lambda row: None)
-    return store.reached, store.differences
-
-
-class _End(Exception):  # noqa: N818 (ends the loop, which has no other end before its budget)
-    """The last wanted generation was computed, or one differs."""
+    stored = _Comparison(run, begin)
+    state = driver.stored_state(stored, search.task) or initial_state(search)
+    elites, clock, reachable = Elites(stored.part), Clock(0.0), reachable_in(search, state)
+    while True:
+        requests = driver.generation(search, elites, stored.part, clock, state)
+        finished = completed(requests, evaluator.evaluate)
+        state = finished.state
+        differences = stored.compared(state.generation, finished.parts, *rows(search, finished, reachable))
+        elites.stored()
+        if differences or state.generation == last:
+            return state.generation, tuple(differences)
 
 
 class _Comparison:
-    """A store for the loop that compares each generation with the run instead of storing it."""
+    """The state of a run at the beginning and what has been computed since, compared with what the run has stored."""
 
-    def __init__(self, run: Run, begin: int | None, last: int) -> None:
+    def __init__(self, run: Run, begin: int | None) -> None:
         self.generation = begin
-        self.reached = -1
-        self.differences: tuple[str, ...] = ()
-        self._run, self._last = run, last
+        self._run = run
         self._stored, self._whole = reader.read_kept(run.folder)
         self._in_force = {} if begin is None else rows_in_force(self._stored, begin)
         self._sum = state_sum(self._in_force)
@@ -158,23 +159,20 @@ class _Comparison:
             return dict(changed)
         return self._run.parts(self.generation, lambda part: part == name)[1][name]
 
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
-        """Compare a generation. Raises _End after the last one, and after one that differs."""
+    def compared(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> list[str]:
+        """What differs in a generation, in words, which is the next one from now on."""
         new = rows_listed(encode_changes(generation, parts))
         old = {part: self._in_force[part] for part in new if part in self._in_force}
         self._sum = changed_sum(self._sum, old, new)
         self._in_force |= new
         self._changed |= parts
-        self.reached = generation
         stored = reader.read_row(self._run.folder, generation)
         differences = _history_differences(self._run, stored, history)
         if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:
             differences.append("the evaluated centres")
         if state_sha256(self._sum) != stored.state:
             differences += _state_differences(self._stored, generation in self._whole, generation, new) or ["the state"]
-        self.differences = tuple(differences)
-        if differences or generation == self._last:
-            raise _End
+        return differences
 
 
 def _history_differences(run: Run, stored: StoredRow, computed: HistoryRow) -> list[str]:

@@ -36,12 +36,12 @@ from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
-from tests.helpers import MemoryStore
+from tests.helpers import AtTheEnd, MemoryStore
 
 CELLS = (50, 50)
 
 
-class Inventing:
+class Inventing(AtTheEnd):
     """Answers every chunk at once: centres end anywhere and are better each time, so that each enters the map."""
 
     counts = DispatchCounts()
@@ -106,7 +106,7 @@ def fill(place: Path, *case: Any) -> None:
     config, search, invented = prepared(*case)
     memory = MemoryStore()
     with contextlib.suppress(_Enough):
-        driver.run(search, invented, memory, None, _stop)
+        driver.drive(driver.run(search, memory, None, _stop), invented)
     parts = memory.parts
     if config.map.enabled:
         parts = filled(parts, policy_spec(config, search.task).parameters, search.task.observation_size)
@@ -139,7 +139,7 @@ def measure(place: Path, *case: Any) -> dict[str, Any]:
             return encoded
 
         writer.encode_changes = encode_changes
-        driver.run(search, invented, store, driver.stored_state(store, search.task), rows.append)
+        driver.drive(driver.run(search, store, driver.stored_state(store, search.task), rows.append), invented)
     driver_ms, store_ms = (
         round(float(np.median([row[f"seconds_{part}"] for row in rows[5:]])) * 1e3, 2) for part in ("driver", "store")
     )

@@ -42,6 +42,7 @@ from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
+from tests.helpers import AtTheEnd
 from workers import worker
 from workers.compilable import Compilable
 from workers.parents import Parents
@@ -54,7 +55,7 @@ MESSAGES = ("send", "read", "arguments", "function", "results", "rest", "answer"
 out, prepare the results, and do the rest; they answer, and the driver reads that."""
 
 
-class Inventing:
+class Inventing(AtTheEnd):
     """Answers every chunk at once: policies end anywhere, and are seldom better than the elites."""
 
     counts = DispatchCounts()
@@ -78,7 +79,7 @@ class Inventing:
         return EpisodesResult(fitness, fitness, place, np.full(slots_L, 200, np.int32), place, None, trace)
 
 
-class Working:
+class Working(AtTheEnd):
     """Has every chunk run by two workers in this process."""
 
     counts = DispatchCounts()
@@ -190,7 +191,7 @@ def measure(batch: int, generations: int, place: Path, given: argparse.Namespace
             setattr(driver, name, timed(function, spent, name))
         with RunStore.create(place, config.resolved_yaml(), meta) as store:
             store.commit = timed(store.commit, spent, "commit")
-            driver.run(search, evaluator, store, None, note)
+            driver.drive(driver.run(search, store, None, note), evaluator)
     finally:
         for name, function in kept.items():
             setattr(driver, name, function)

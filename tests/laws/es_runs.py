@@ -46,5 +46,5 @@ def run_in_memory(config, evaluator=None, store=None):
         SHIPPED["point_maze"],
     )
     store = store or MemoryStore()
-    state, reason = driver.run(search, evaluator, store, None, lambda row: None)
+    state, reason = driver.drive(driver.run(search, store, None, lambda row: None), evaluator)
     return state, store, evaluator, reason

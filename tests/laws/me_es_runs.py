@@ -96,7 +96,9 @@ def run_in_memory(config, evaluator=None, store=None, algorithm=None):
     search = driver.Search(
         config, algorithm, lambda: (first_centres(config), no_observations(2)), SHIPPED["point_maze"]
     )
-    state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
+    state, _ = driver.drive(
+        driver.run(search, store, driver.stored_state(store, search.task), lambda row: None), evaluator
+    )
     return state, store, evaluator
 
 

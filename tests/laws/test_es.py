@@ -22,7 +22,7 @@ from es_service.protocol.messages import (
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import merge_moments, no_observations
-from tests.helpers import MemoryStore
+from tests.helpers import AtTheEnd, MemoryStore
 from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
 from tests.references import es as reference
 from workers.environments import SHIPPED
@@ -262,7 +262,7 @@ def test_an_infinite_fitness_gives_no_warning():
     assert np.isnan(store.rows[5]["centre_fitness_std"])
 
 
-class Inventing:
+class Inventing(AtTheEnd):
     """Answers every chunk at once, with made-up numbers and one shared partial gradient."""
 
     counts = DispatchCounts()
@@ -296,7 +296,7 @@ def test_the_driver_holds_no_population_times_parameters_array():
     )
     evaluator = Inventing(shape.parameters)
     tracemalloc.start()
-    driver.run(search, evaluator, MemoryStore(), None, lambda row: None)
+    driver.drive(driver.run(search, MemoryStore(), None, lambda row: None), evaluator)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 2048 * shape.parameters * 4 / 10

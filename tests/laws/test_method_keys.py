@@ -199,7 +199,7 @@ def digest(config):
     first = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
     algorithm = ALGORITHMS[config.search.algorithm](config)
     search = driver.Search(config, algorithm, lambda: (first, no_observations(2)), TASK)
-    driver.run(search, evaluator(config), store, None, lambda row: None)
+    driver.drive(driver.run(search, store, None, lambda row: None), evaluator(config))
     total = hashlib.sha256()
     for parts in store.after:
         for name in sorted(parts):

@@ -14,6 +14,7 @@ from es_service.config.parts import (
     TargetObjective,
 )
 from es_service.loop.generation import halves
+from es_service.protocol.evaluator import completed
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.common import first_state, scheduled
@@ -183,6 +184,6 @@ def test_the_halves_of_a_population_add_up_and_agree_as_the_cosine_between_them(
         (ones * [1, 1, 0, -1], 0.0),  # they point away from each other
         (ones * [1, 0, 0, 0] + ones * [0, 0, -1, 1], 1.0),  # [1, 0] and [1, 0]
     ):
-        [gradient_D], [found] = halves(evaluator, 1, [np.asarray(weights, np.float32)], 2)
+        [gradient_D], [found] = completed(halves(1, [np.asarray(weights, np.float32)], 2), evaluator.evaluate)
         assert np.allclose(gradient_D, weights @ noise_P_D / 4)
         assert found == pytest.approx(agreement)

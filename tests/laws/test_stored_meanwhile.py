@@ -7,7 +7,12 @@ import pytest
 
 from es_service.errors import EvaluationError
 from es_service.loop import driver
+from es_service.loop.clock import Clock
+from es_service.loop.elites import Elites
+from es_service.loop.generation import initial_state
 from es_service.loop.interfaces import Stop
+from es_service.protocol.evaluator import completed
+from es_service.protocol.messages import EvaluationChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.laws.me_es_runs import Remembering, Sharing, first_centres
@@ -45,23 +50,27 @@ class Noting(Remembering):
         super().commit(generation, parts, history, evaluations)
 
 
-def run(evaluator, notes, report=lambda row: None, ask=lambda asked, generation: asked):
-    config, store = config_of(GENERATIONS, episodes=1), Noting(notes)
+def search_of(ask=lambda asked, generation: asked):
+    config = config_of(GENERATIONS, episodes=1)
     algorithm = ALGORITHMS["map_elites"](config)
-    search = driver.Search(
+    return driver.Search(
         config,
         replace(algorithm, ask=lambda state, generation: ask(algorithm.ask(state, generation), generation)),
         lambda: (first_centres(config), no_observations(2)),
         SHIPPED["point_maze"],
     )
-    return store, lambda: driver.run(search, evaluator, store, None, report)
+
+
+def run(evaluator, notes, report=lambda row: None, ask=lambda asked, generation: asked):
+    search, store = search_of(ask), Noting(notes)
+    return store, lambda: driver.drive(driver.run(search, store, None, report), evaluator)
 
 
 def test_a_generation_is_stored_after_the_next_was_sent_and_before_its_results_are_awaited():
     notes = []
     beside, compute = run(Beginning(notes), notes)
     compute()
-    expected = []
+    expected = [("sent", 0), ("waited for", 0)]
     for generation in range(1, GENERATIONS + 1):
         expected += [("sent", generation), ("stored", generation - 1), ("waited for", generation)]
     assert notes == [*expected, ("stored", GENERATIONS)]
@@ -73,6 +82,27 @@ def test_a_generation_is_stored_after_the_next_was_sent_and_before_its_results_a
         for name, arrays in some.items():
             for key, array in arrays.items():
                 np.testing.assert_array_equal(array, others[name][key])
+
+
+def test_a_list_of_results_drives_a_generation():
+    search, work_of, results_of = search_of(), [], []
+
+    def compute(work):
+        work_of.append(work)
+        results_of.append(Sharing().evaluate(work))
+        return results_of[-1]
+
+    def bits(evaluate):
+        requests = driver.generation(search, Elites({}.get), {}.get, Clock(0.0), initial_state(search))
+        parts = completed(requests, evaluate).parts
+        return {name: {key: array.tobytes() for key, array in (part or {}).items()} for name, part in parts.items()}
+
+    computed = bits(compute)
+    assert {type(chunk) for _, chunk in work_of[0]} == {EvaluationChunk}
+    assert bits(lambda work: results_of.pop(0)) == computed
+    results_of.append([replace(result, fitness=result.fitness + 1) for result in Sharing().evaluate(work_of[0])])
+    assert bits(lambda work: results_of.pop(0)) != computed
+    assert not results_of
 
 
 def test_a_stop_ends_the_run_with_the_generation_that_was_reported():

@@ -10,6 +10,7 @@ from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, Ranks, Returns, Signs, TopPairs
 from es_service.loop.generation import estimate_gradients
+from es_service.protocol.evaluator import completed
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import centred_ranks, pair_signs, pair_weights, shaped, standardised
@@ -77,7 +78,7 @@ def test_swapping_signs_negates_the_gradient_estimate_exactly(shaping):
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
     estimates = [
-        estimate_gradients(evaluator, 1, [pair_weights(shaped(KINDS[shaping], values))], 20)[0]
+        completed(estimate_gradients(1, [pair_weights(shaped(KINDS[shaping], values))], 20), evaluator.evaluate)[0]
         for values in (fitness, fitness[:, ::-1])
     ]
     assert np.abs(estimates[0]).max() > 0
@@ -92,7 +93,7 @@ def test_gradient_by_hand_three_pairs():
     )
     weights = np.float32([1.0, -0.5, 0.25])
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    (found,) = estimate_gradients(evaluator, 1, [weights], 2)
+    (found,) = completed(estimate_gradients(1, [weights], 2), evaluator.evaluate)
     noise = [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(3))]
     np.testing.assert_allclose(found, (noise[0] - 0.5 * noise[1] + 0.25 * noise[2]) / 3, rtol=1e-5, atol=1e-6)
 
@@ -160,7 +161,7 @@ def test_blocks_of_the_gradient_are_added_in_the_tree():
         def evaluate(self, work):
             return [GradientResult(np.float32([x])) for x in (1e8, 1.0, -1e8, 1.0, 3.0)]
 
-    (found,) = estimate_gradients(Answers(), 1, [np.ones(5, np.float32)], 1)
+    (found,) = completed(estimate_gradients(1, [np.ones(5, np.float32)], 1), Answers().evaluate)
     assert found[0] == np.float32(3.0) * np.float32(1 / 5)  # one by one it is 4 / 5
 
 

@@ -144,9 +144,12 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     )  # fmt: skip
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", Told(told))
-    monkeypatch.setattr(
-        sessions, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "", True)
-    )  # as workers know of no such option
+
+    def work(*_, **__):  # as workers know of no such option
+        yield from ()
+        return api.Outcome(api.open_run(tmp_path / "run"), "", True)
+
+    monkeypatch.setattr(sessions, "work", work)
     api.run(SMALL, tmp_path / "run")
     assert (
         lineage.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
