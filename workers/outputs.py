@@ -73,6 +73,9 @@ OUTPUTS: Mapping[str, Output] = {
         lambda environment, state, _: jnp.float32(0.0),
         lambda environment, step, before: jnp.asarray(step.reward, jnp.float32),
     ),
+    "first_observation": Output(
+        lambda environment, state, _: _observation(environment, state), lambda environment, step, before: before
+    ),
     "last_observation": _of_state(_observation),
     "observation": Output(
         lambda environment, state, _: _observation(environment, state),

@@ -57,6 +57,19 @@ def evaluate(
             help="With --certify: select by return, last_reward, success or goal_distance; default: by task.fitness.",
         ),
     ] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            "--task",
+            metavar="NAME",
+            help="With --certify: certify in another task, too, such as gymnasium:Ant-v5; a name as in a config.",
+            show_default=False,
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="With --task: an option of it, e.g. task.options.x=5."),
+    ] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[
         Path | None, typer.Option("--out", parser=given_path, help="Also write the rows to this CSV file.")
@@ -77,12 +90,14 @@ def evaluate(
         for _, result in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
             if isinstance(result, ConfigError) and result.field == "compute.workers":
                 raise result
-    alone = {"--all": every or None, "--seed": seed} if certify else {"--keep": keep, "--by": by}
+    alone = {"--all": every or None, "--seed": seed} if certify else {"--keep": keep, "--by": by, "--task": task}
     for option, value in alone.items():
         if value is not None and certify:
             raise ConfigError(f"{option} and --certify cannot be combined; leave one of them out")
         if value is not None:
             raise ConfigError(f"{option} {value} needs --certify; add it, or leave {option} out")
+    if set_ and task is None:
+        raise ConfigError(f"--set {set_[0]} needs --task, whose options it sets; add it, or leave --set out")
     single = is_single(folders)
     begun = of_each(folders, lambda run: run)
     width = None if single else max((len(str(run)) for run, result in begun if result is not None), default=0)
@@ -108,7 +123,7 @@ def evaluate(
 
     def certified_rows(folder: Path) -> Iterator[dict[str, Any]]:
         anything = best or centre or cells
-        given: dict[str, Any] = {"episodes": episodes, "keep": keep, "by": by}
+        given: dict[str, Any] = {"episodes": episodes, "keep": keep, "by": by, "task": task, "overrides": set_}
         certified = certify_run(
             folder, best=best or not anything, centre=centre, cells=cells, top=0 if anything and top is None else top,
             generation=generation, workers=workers, on_notice=tell,

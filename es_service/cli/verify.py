@@ -12,6 +12,7 @@ from es_service.cli.console import console, print_line
 from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
 from es_service.errors import RunLockedError
+from es_service.runs.certification import Recomputed as RecomputedEpisodes
 from es_service.runs.certification import recomputed as recomputed_certifications
 from es_service.runs.checked_config import changed_config
 from es_service.runs.repeating import why_not_repeatable
@@ -29,7 +30,7 @@ def verify(
     log_level: LogLevelOption = None,
 ) -> None:
     """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs, 3 if
-    this cannot be judged: the run is running, or its task does not repeat itself."""
+    this cannot be judged: the run is running, or a task cannot be run here or does not repeat itself."""
     run = api.open_run(folder)
     try:
         recomputed = recompute(run, generations, workers)
@@ -42,34 +43,37 @@ def verify(
         groups.append(group)
         if not as_json:
             print_line(console, _line(group))
-    certified = []
-    for policy, differences, changes in recomputed_certifications(run, workers):
-        certified.append((policy, differences))
+    certified: list[RecomputedEpisodes] = []
+    for one in recomputed_certifications(run, workers):
+        certified.append(one)
         if not as_json:
-            what = f"differs: {', '.join(differences)}" if differences else "equal"
-            since = f"; since it was made: {', '.join(changes)}" if changes else ""
-            kind = "decision" if policy.decides else "certification"
-            print_line(console, f"{kind} {policy.number}, {policy.name}: {what}{since}")
+            print_line(console, _certified_line(one))
+    differs = any(group.differences for group in groups) or any(one.differences for one in certified)
     why = ""
-    if any(group.differences for group in groups) or any(differences for _, differences in certified):
+    if differs:
         why = why_not_repeatable(run, changed_config(run.present_config, name=str(run.config_file)))
-    equal = not any(group.differences for group in groups) and not any(differences for _, differences in certified)
+    is_judged = not why and not any(one.not_judged for one in certified)
     if as_json:
         print_json(
             {
                 "digest": digest,
-                "equal": equal,
+                "equal": not differs,
                 "does_not_repeat": why,
                 "recomputed": [asdict(group) for group in groups],
                 "certified": [
-                    {"certification": policy.number, "policy": policy.name, "differences": differences}
-                    for policy, differences in certified
+                    {
+                        "certification": one.policy.number,
+                        "policy": one.policy.name,
+                        "differences": one.differences,
+                        "not_judged": one.not_judged,
+                    }
+                    for one in certified
                 ],
             }
         )
     else:
         again = sum(group.last - group.first + 1 for group in groups)
-        print(f"{digest}  {'equal' if equal else 'different'}")
+        print(f"{digest}  {'different' if differs else 'equal'}")
         print_note(f"{again:,} of {(run.generation or 0) + 1:,} generations were computed again")
         if why:
             print_note(
@@ -77,7 +81,16 @@ def verify(
                 f"returns other numbers {why}. So the differences do not say that the run is wrong, and it cannot be "
                 "verified"
             )
-    raise typer.Exit(0 if equal else 3 if why else 1)
+    raise typer.Exit(1 if differs and not why else 0 if is_judged else 3)
+
+
+def _certified_line(one: RecomputedEpisodes) -> str:
+    kind = "decision" if one.policy.decides else "certification"
+    where = "" if one.policy.elsewhere is None else f", also in {one.policy.elsewhere.title}"
+    what = f"differs: {', '.join(one.differences)}" if one.differences else "equal"
+    since = f"; since it was made: {', '.join(one.changes)}" if one.changes else ""
+    unknown = f", but {one.not_judged}" if one.not_judged else ""
+    return f"{kind} {one.policy.number}, {one.policy.name}{where}: {what}{unknown}{since}"
 
 
 def _line(group: Recomputed) -> str:

@@ -143,6 +143,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
         | {
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
+            "action_bounds": bounds(fields.get("action_bounds", ())),
             "walls": None if fields.get("walls") is None else tuple(bounds(wall) for wall in fields["walls"]),
             "notes": tuple(fields.get("notes", ())),
             "goal": None if fields.get("goal") is None else tuple(fields["goal"]),

@@ -84,6 +84,9 @@ class TaskSpec:
     """What the task is made of, on which it depends which rollouts can compute it."""
     discrete_actions: bool = False
     """Whether an action is a choice of one of `action_size` actions, so that the policy has to choose one."""
+    action_bounds: Bounds = ()
+    """What the actions -1 and 1 of a policy become, (low, high) for each number of an action; empty if they stay -1 and
+    1."""
     parameters: ParameterSpec | None = None
     """Parameters of a function that is the task; None for all other tasks."""
     deterministic: bool = False
@@ -323,7 +326,8 @@ class EpisodesResult:
     """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays.
 
     success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step;
-    last_observation [..., O]: observation after it. A member has the mean of its episodes, float32."""
+    last_observation [..., O]: observation after it; first_observation [..., O]: that of the reset. A member has the
+    mean of its episodes, float32."""
     of_steps: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Outputs of each step that it names, [K, ...]: the valid steps of all episodes, one episode after another in the
     order of the other arrays, with as many rows as `steps` says of each.

@@ -18,6 +18,7 @@ Functions for both the driver and the workers take the array namespace as `xp` (
 
 from __future__ import annotations
 
+import hashlib
 import math
 from enum import IntEnum
 from typing import Any
@@ -54,6 +55,9 @@ class Domain(IntEnum):
     """Resets of episodes that say what the elites of a map are worth, from which the search learns nothing."""
     DECISION_RESET = 11
     """Resets of episodes that decide whether a run has reached `budget.target_certified`."""
+    OTHER_TASK_RESET = 12
+    """Resets of episodes that report the value of a policy in another task and, for the gap, in its own; their seed is
+    `seed_for` the other task."""
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -103,6 +107,11 @@ def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int,
     halves = _mix64(state[..., None] + _HALVES)
     words = halves.astype("<u8", copy=False).view("<u4")  # the lower half of each 64-bit word comes first
     return words if isinstance(domain, tuple) else words[0]
+
+
+def seed_for(seed: int, name: str) -> int:
+    """Seed below 2^63 of the streams of a run that belong to something with a name."""
+    return int.from_bytes(hashlib.sha256(f"{seed}\0{name}".encode()).digest()[:8], "little") >> 1
 
 
 def evaluation_reset_keys(

@@ -21,7 +21,7 @@ from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.report.series import X_AXES, Columns
-from es_service.runs.certified import Certified, newest_certified
+from es_service.runs.certified import Certified, certified_elsewhere, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.strangers import sizes_of, sound_meta
 from es_service.runs.view import Run, is_light
@@ -55,6 +55,8 @@ class RunData:
     """Generation and fitness of the best centre; None before the first generation."""
     certified: Certified | None
     """The policy that the newest certification has put first; None if there is none, or if it cannot be read."""
+    certified_elsewhere: Mapping[str, Certified]
+    """What `certified_elsewhere` returns; empty if it cannot be read."""
     status: RunStatus
     platforms: list[tuple[int, dict[str, Any]]]
     """(first generation, platform); each applies until the next one."""
@@ -140,6 +142,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     if lacking := [column for column in X_AXES if not np.isfinite(history[column]).all()]:
         raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
+    certified, elsewhere = _certified(folder, problems)
     spec, point_D = task.parameters, None if best is None else best.get(POINT)
     return RunData(
         folder=folder,
@@ -150,7 +153,8 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         map=_map(found, problems),
         paths=_paths(found),
         best=None if best is None else (int(best["generation"]), float(best["fitness"])),
-        certified=_certified(folder, problems),
+        certified=certified,
+        certified_elsewhere=elsewhere,
         status=status_at(run, driver, found.newest),
         platforms=found.platforms,
         digest="",
@@ -200,10 +204,11 @@ def _paths(sound: SoundRun) -> dict[int, NDArray[np.float32]]:
     }
 
 
-def _certified(folder: Path, problems: list[str]) -> Certified | None:
+def _certified(folder: Path, problems: list[str]) -> tuple[Certified | None, Mapping[str, Certified]]:
+    """The certified policy, and those in other tasks."""
     try:
-        return newest_certified(folder)
+        return newest_certified(folder), certified_elsewhere(folder)
     except StoreError as error:
         if error.sentence not in problems:
             problems.append(error.sentence)
-        return None
+        return None, {}

@@ -12,11 +12,12 @@ from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
-from es_service.runs.certified import failed_sentence, measure_of, tries_sentence
+from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
 from es_service.runs.identity import code_changes
 from es_service.runs.objectives import objectives, weights
 from es_service.runs.recent import invalid_members
 from es_service.runs.run_status import population_size, state
+from es_service.runs.selection import Measure
 
 
 class Fault(NamedTuple):
@@ -50,7 +51,28 @@ def verdict(data: RunData) -> str:
     if data.map is not None:
         cells, size = data.map.size, data.map.geometry.size
         sentence += f"; {cells:,} of {size:,} cells of the behaviour map are filled ({100 * cells / size:.1f} %)"
-    return f"{_certified(data)}{sentence}."
+    return f"{_certified(data)}{_elsewhere(data)}{sentence}."
+
+
+def _elsewhere(data: RunData) -> str:
+    """The values of certified policies in other tasks, a sentence for each that others follow."""
+    measure = measure_of(data.constants["task.fitness"])
+    return "".join(
+        f"In {task}, the certified policy {policy.title} has a mean {measure.replace('_', ' ')} of "
+        f"{elsewhere_text(policy, measure)}. "
+        for task, policy in data.certified_elsewhere.items()
+    )
+
+
+def elsewhere_text(policy: Certified, measure: Measure) -> str:
+    """The value of a certified policy in another task, and its gap to that in the run's task, in words."""
+    row = policy.row()
+    value, gap = (
+        "{} ({} to {})".format(*(number(row[f"{prefix}_{measure}_{end}"]) for end in ("mean", "low", "high")))
+        for prefix in ("elsewhere", "gap")
+    )
+    episodes, starts = counted(row["elsewhere_episodes"], "episode"), pairs_sentence(paired=row["elsewhere_paired"])
+    return f"{value} in {episodes}, a gap of {gap} to the run's task, {starts}"
 
 
 def _certified(data: RunData) -> str:

@@ -21,6 +21,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
@@ -28,21 +29,22 @@ from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.noise import Domain
 from es_service.runs.certified import (
     EPISODES,
-    MEASURES,
     Certified,
-    Measure,
+    Elsewhere,
     all_certifications,
     arrays_of,
     measure_of,
+    resets_of,
     stored,
 )
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
-from es_service.runs.selection import Parameters, halved, new_episodes
+from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task, stored_task
+from es_service.runs.repeating import why_task_does_not_repeat
+from es_service.runs.selection import MEASURES, Episodes, Measure, Parameters, halved, kept, new_episodes, results_of
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
@@ -52,6 +54,19 @@ OTHER_PROGRAMS = 2**40
 """Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
 TOP = 10
 """Default number of elites that are candidates beside the best centre."""
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """A stored certification or decision whose episodes were run again."""
+
+    policy: Certified
+    differences: tuple[str, ...]
+    """Names of the results that differ."""
+    changes: list[str]
+    """What has changed in packages, processor and code since it was made, in words."""
+    not_judged: str = ""
+    """Why nothing can be said of the episodes in another task; empty if it can, or if there are none."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +90,15 @@ def certify_run(
     episodes: int = EPISODES,
     keep: int = 1,
     by: Measure | None = None,
+    task: str | None = None,
+    overrides: Overrides = (),
     workers: int | None = None,
     on_notice: Callable[[str], None] = warn,
 ) -> list[Certified]:
     """Certify policies of a run on this machine, and store the results in the run.
+
+    With `task`, the policies that remain get as many episodes in this other task, too, such as the same one in another
+    simulator. Selection asks only the run's own task.
 
     Args:
         best, centre, cells, top: the candidates: the best centre, the newest centre, elites of cells, and the elites
@@ -88,6 +108,8 @@ def certify_run(
         keep: number of policies that remain after selection.
         by: what selection ranks by; None: what the run's `task.fitness` says. Equal ones rank by their return, and then
             in the order of the candidates.
+        task: name of the other task; None: none.
+        overrides: its options, such as "task.options.frame_skip=5"; see `other_task`.
         workers: number of worker processes; None: one per core.
         on_notice: called with a sentence about each repair of the run, and when the workers compile for more than two
             seconds; by default, these are RuntimeWarnings.
@@ -97,7 +119,8 @@ def certify_run(
 
     Raises:
         RunLockedError: a driver is writing to the run; the message names it. NotInRunError: a candidate does not exist.
-        ConfigError: a number is wrong, or the task does not have what `by` names. EvaluationError: the rollouts cannot
+        ConfigError: a number is wrong, the task does not have what `by` names, or the other task does not fit the
+        policies. EvaluationError: the rollouts cannot
         continue. Interrupted: SIGINT or SIGTERM arrived. Then nothing is stored.
     """
     for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("top", top or 0, 0)):
@@ -105,15 +128,16 @@ def certify_run(
     run = open_run(folder)
     with opened(run, workers, on_notice) as (store, config):
         _measure(config, by)  # refused before workers start if wrong
+        other = None if task is None else other_task(config, task, overrides)
+        for difference in () if other is None else other.differences:
+            on_notice(difference)
         if top is None:
             top = TOP if config.map.enabled else 0
         chosen = candidates(run, best=best, centre=centre, cells=cells, every=False, top=top, generation=generation)
         if not chosen:
             why = "its map is empty" if top else "no candidate is named"
             raise NotInRunError(f"{run.folder}: there is no policy to certify; {why}", run=run.folder)
-        with workers_for(config, on_notice) as engine:
-            number = store.next_certification
-            certified = _certify(engine, config, different(chosen), number, episodes, keep, by)
+        certified = _certify(config, different(chosen), store.next_certification, episodes, keep, by, other, on_notice)
         add_certified(store, certified, on_notice)
     return certified
 
@@ -181,42 +205,62 @@ def certify(
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
     given = [Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
-    with workers_for(config) as engine:
-        return _certify(engine, config, given, OTHER_PROGRAMS + number, episodes, keep, by)
+    return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by)
 
 
-def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...], list[str]]]:
-    """The stored certifications and decisions, each with the names of the results that differ if its episodes are run
-    again, and with what has changed in packages, processor and code since it was made, in words."""
+def recomputed(run: Run, workers: int | None = None) -> Iterator[Recomputed]:
+    """The stored certifications and decisions with what comes of their episodes on this machine now."""
     certified = all_certifications(run.folder)
     if not certified:
         return
     config = evaluation_config(run, workers)
-    now = platform_of(config)
     with workers_for(config) as engine:
         for policy in certified:
-            domain = Domain.DECISION_RESET if policy.decides else Domain.CERTIFICATION_RESET
-            asked = [policy.policy], policy.episodes.count, config.seed, policy.number
-            [episodes] = new_episodes(engine, *asked, 0, domain)
-            again, then = arrays_of(episodes), arrays_of(policy.episodes)
-            equal = {name for name in then if name in again and then[name].tobytes() == again[name].tobytes()}
-            yield policy, tuple(name for name in then if name not in equal), changes_since(policy.platform, now)
+            differences, other, why = _differences(engine, config, policy, policy.episodes), None, ""
+            if policy.elsewhere is not None:
+                task, there = policy.elsewhere.task, ()
+                try:
+                    other = stored_task(config, policy.elsewhere)
+                    with workers_for(other.config) as elsewhere:
+                        there = _differences(elsewhere, config, policy, policy.elsewhere.episodes)
+                    if there and (where := why_task_does_not_repeat(other.config)):
+                        why = f"{task} does not repeat itself: with the same seed it returns other numbers {where}"
+                except ConfigError as error:  # such as a package that is missing here
+                    why = f"the episodes in {task} cannot be run again: {error.sentence}"
+                differences += () if why else tuple(f"{name} in {task}" for name in there)
+            yield Recomputed(policy, differences, changes_since(policy.platform, platform_of(config, other)), why)
+
+
+def _differences(engine: Evaluator, config: RunConfig, policy: Certified, then: Episodes) -> tuple[str, ...]:
+    """Names of the results that differ from stored ones if the episodes of a certified policy are run again."""
+    seed, domain = policy.resets(config.seed)
+    [episodes] = new_episodes(engine, [policy.policy], then.count, seed, policy.number, 0, domain)
+    before, again = arrays_of(then), arrays_of(episodes)
+    return tuple(name for name in before if name not in again or before[name].tobytes() != again[name].tobytes())
 
 
 def _certify(
-    engine: Evaluator,
     config: RunConfig,
     given: Sequence[Named],
     number: int,
     episodes: int,
     keep: int,
     by: Measure | None,
+    other: OtherTask | None = None,
+    on_compile: Callable[[str], None] = lambda sentence: None,
 ) -> list[Certified]:
-    """Select among candidates, then certify those that remain."""
-    measure = _measure(config, by)
-    ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
-    policies, platform = [given[record.index].policy for record in ranked], platform_of(config)
-    results = new_episodes(engine, policies, episodes, config.seed, number, 0, Domain.CERTIFICATION_RESET)
+    """Select among candidates, then certify those that remain, in another task, too, if there is one."""
+    measure, platform = _measure(config, by), platform_of(config, other)
+    seed, domain = resets_of(config.seed, None if other is None else other.task.name)
+    with workers_for(config, on_compile, () if other is None else (FIRST_OBSERVATION,)) as engine:
+        ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
+        policies = [given[record.index].policy for record in ranked]
+        results = results_of(engine, policies, episodes, seed, number, 0, domain)
+    elsewhere: list[Elsewhere | None] = [None] * len(ranked)
+    if other is not None:
+        with workers_for(other.config, on_compile, (FIRST_OBSERVATION,)) as engine:
+            there = results_of(engine, policies, episodes, seed, number, 0, domain)
+        elsewhere = [elsewhere_of(other, *pair) for pair in zip(results, there, strict=True)]
     certified = []
     for rank, (record, result) in enumerate(zip(ranked, results, strict=True)):
         candidate = given[record.index]
@@ -235,16 +279,18 @@ def _certify(
                 False,
                 0,
                 platform,
-                result,
+                kept(result),
                 *candidate.policy,
+                elsewhere[rank],
             )
         )
     return certified
 
 
-def platform_of(config: RunConfig) -> dict[str, Any]:
-    """What computes episodes in this process, as it is stored."""
-    return {**platform_info(), CODE: code_of(config)}
+def platform_of(config: RunConfig, other: OtherTask | None = None) -> dict[str, Any]:
+    """What computes episodes in this process, as it is stored: those of a run, and of another task if there is one."""
+    code = [code_of(one) for one in (config, *([] if other is None else [other.config]))]
+    return {**platform_info(), CODE: {file: sha256 for of in code for file, sha256 in of.items()}}
 
 
 def different(chosen: Sequence[Candidate]) -> list[Named]:
@@ -262,11 +308,13 @@ def different(chosen: Sequence[Candidate]) -> list[Named]:
 
 
 def workers_for(
-    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None
+    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None, outputs: tuple[str, ...] = ()
 ) -> AbstractContextManager[Evaluator]:
-    """Workers on this machine that give what certification keeps."""
+    """Workers on this machine that give what certification keeps, and more outputs of episodes."""
     task = task_of(config)
-    return workers_of(config, worker_spec(config, task, outputs_of(task)), None, on_compile)
+    if task.parameters is not None:
+        outputs = ()  # a function has no observations
+    return workers_of(config, worker_spec(config, task, (*outputs_of(task), *outputs)), None, on_compile)
 
 
 def outputs_of(task: TaskSpec) -> tuple[str, ...]:

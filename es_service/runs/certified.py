@@ -11,16 +11,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import create_model
 
+from es_service.config.yaml_text import show
 from es_service.errors import StoreError
 from es_service.loop.forms import BOOL, INTEGER, REAL, Sizes, array_problem
 from es_service.protocol.messages import FloatArray
-from es_service.runs.intervals import false_pass_share, mean_interval, share_interval
+from es_service.protocol.noise import Domain, seed_for
+from es_service.runs.intervals import false_pass_share, gap_interval, share_gap_interval
+from es_service.runs.selection import Episodes, Measure, interval_columns
 from es_service.runs.strangers import sizes_of
 from es_service.store.certifications import CertifiedRow
 from es_service.store.facts import Damaged, Form, require_form
@@ -32,54 +35,39 @@ SHOWN_TRIES = 10
 """Most decisions whose values a sentence shows."""
 BELOW = 0.1
 """Standard deviations below a target of the policies by which it is said how easily a decision is lucky."""
-Measure = Literal["return", "last_reward", "success", "goal_distance"]
-"""What selection episodes rank by; the least goal distance ranks by its negative, since higher is better."""
-MEASURES: tuple[Measure, ...] = get_args(Measure)
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """What is kept of episodes of a policy, whatever the run's `task.fitness` is."""
+class Elsewhere:
+    """The episodes of a certified policy in another task."""
 
-    return_E: NDArray[np.float64]
-    """Sum of the rewards."""
-    last_reward_E: NDArray[np.float64]
-    """Reward of the last valid step."""
-    goal_distance_E: NDArray[np.float64]
-    """Least distance to the goal along the episode; NaN if the task has no goal."""
-    success_E: NDArray[np.bool_] | None
-    """Whether the episode succeeded; None if the task does not declare success."""
-    steps_E: NDArray[np.int64]
-    descriptor_E_B: NDArray[np.float64]
-
-    @property
-    def steps(self) -> int:
-        """Environment steps of all episodes."""
-        return int(self.steps_E.sum())
+    task: str
+    options: Mapping[str, Any]
+    """Options of the task that were set; others have its defaults."""
+    descriptor: str | list[int] | None
+    """Descriptor that was chosen for it, as in a config; None: that of the task."""
+    rollout: str
+    paired: bool
+    """Whether episode e begins with the same observation in both tasks, for all e. If not, each task has drawn its own
+    starts, and its episodes do not depend on those of the other."""
+    episodes: Episodes
 
     @property
-    def count(self) -> int:
-        """Number of episodes."""
-        return self.return_E.size
+    def title(self) -> str:
+        """The task and the options that were set: "mujoco:Ant-v5 (solver_iterations = 6)"."""
+        options = ", ".join(f"{name} = {show(value)}" for name, value in self.options.items())
+        return f"{self.task} ({options})" if options else self.task
 
-    def fitness(self, kind: str) -> NDArray[np.float64]:
-        """Fitness of each episode, [E]; `kind` is `task.fitness`."""
-        return self.return_E if kind == "sum" else self.last_reward_E
-
-    def mean_fitness(self, kind: str) -> float:
-        """Mean of `fitness`."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            return float(self.fitness(kind).mean())
-
-    def values(self) -> dict[str, float | int | None]:
-        """Means with their intervals, and successes, by column name; None for what the task does not have."""
-        columns: dict[str, float | int | None] = {}
-        for name, values_E in (("return", self.return_E), ("last_reward", self.last_reward_E)):
-            columns |= _interval(name, values_E)
-        columns |= _interval("goal_distance", None if np.isnan(self.goal_distance_E).all() else self.goal_distance_E)
-        successes = None if self.success_E is None else int(self.success_E.sum())
-        low, high = (None, None) if successes is None else share_interval(successes, self.count)
-        return columns | {"successes": successes, "success_low": low, "success_high": high}
+    def gaps(self, here: Episodes) -> dict[str, float | None]:
+        """How much higher each mean and the share of successes are than `here`, with intervals, by column name; None
+        for what one of the tasks does not have."""
+        columns: dict[str, float | None] = {}
+        for name in ("return", "last_reward", "goal_distance", "success"):
+            pair = [getattr(episodes, f"{name}_E") for episodes in (here, self.episodes)]
+            has_it = not any(values_E is None or np.isnan(values_E).all() for values_E in pair)
+            interval_of = share_gap_interval if name == "success" else gap_interval
+            columns |= interval_columns(f"gap_{name}", interval_of(*pair, paired=self.paired) if has_it else None)
+        return columns
 
 
 @dataclass(frozen=True)
@@ -115,6 +103,8 @@ class Certified:
     parameters_D: FloatArray
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
+    elsewhere: Elsewhere | None = None
+    """The same policy in another task; None if it was not asked for."""
 
     @property
     def policy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -127,8 +117,24 @@ class Certified:
         120"."""
         return self.name if self.generation is None else f"{self.name} of generation {self.generation:,}"
 
+    def resets(self, seed: int) -> tuple[int, Domain]:
+        """Seed and domain of the resets of its episodes, those of a run with this seed."""
+        if self.decides:
+            return seed, Domain.DECISION_RESET
+        return resets_of(seed, None if self.elsewhere is None else self.elsewhere.task)
+
     def row(self) -> dict[str, Any]:
-        """The policy as a row of a table."""
+        """The policy as a row of a table.
+
+        Only with episodes in another task, it has the columns `elsewhere` (the title of the task), `elsewhere_*` (its
+        values there) and `gap_*` (how much higher these are than those in the run's task, with intervals).
+        """
+        there: dict[str, Any] = {}
+        if self.elsewhere is not None:
+            values = {"episodes": self.elsewhere.episodes.count, **self.elsewhere.episodes.values()}
+            there = {"elsewhere": self.elsewhere.title, "elsewhere_paired": self.elsewhere.paired}
+            there |= {f"elsewhere_{name}": value for name, value in values.items()}
+            there |= self.elsewhere.gaps(self.episodes)
         return {
             "certification": self.number,
             "rank": self.rank,
@@ -144,7 +150,18 @@ class Certified:
             "tries": self.tries,
             "episodes": self.episodes.count,
             **self.episodes.values(),
+            **there,
         }
+
+
+def resets_of(seed: int, task: str | None) -> tuple[int, Domain]:
+    """Seed and domain of the resets of certification episodes of a run with this seed.
+
+    Args:
+        task: name of the other task in which the policies are certified, too: episode e has the same reset in both,
+            and no other certification has it.
+    """
+    return (seed, Domain.CERTIFICATION_RESET) if task is None else (seed_for(seed, task), Domain.OTHER_TASK_RESET)
 
 
 def all_certifications(folder: Path) -> list[Certified]:
@@ -166,6 +183,15 @@ def newest_certified(folder: Path) -> Certified | None:
     rows = read_certifications(folder, newest=lambda facts: not facts.get("decides"))
     first = next((row for row in rows if row.rank == 0), None)
     return None if first is None else _from_row(folder, first, sizes_of(read_meta(folder)))
+
+
+def certified_elsewhere(folder: Path) -> dict[str, Certified]:
+    """Title of another task -> the policy that the newest certification in it has put first. Raises StoreError if a
+    policy that was certified in another task is damaged."""
+    rows = read_certifications(folder, holding=f'"{_ELSEWHERE}"')
+    sizes = sizes_of(read_meta(folder)) if rows else None
+    firsts = [_from_row(folder, row, sizes) for row in rows if sizes is not None and row.rank == 0]
+    return {one.elsewhere.title: one for one in firsts if one.elsewhere is not None}
 
 
 def decisions(policies: Iterable[Certified]) -> list[Certified]:
@@ -243,36 +269,64 @@ def tries_sentence(tries: int) -> str:
     return f"try {tries:,} of the tries so far, with any target ({lucky})"
 
 
+def pairs_sentence(*, paired: bool) -> str:
+    """What the gap between the episodes of a policy in two tasks compares, in words."""
+    return "with the same starts in both tasks" if paired else "with starts of their own in each task"
+
+
 def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
     """The arrays of episodes by name, for the store."""
     return {name: array for name, array in vars(episodes).items() if array is not None}
 
 
 _POLICY = ("parameters_D", "observation_mean_O", "observation_std_O")
-_FACTS = [field.name for field in fields(Certified) if field.name not in (*_POLICY, "number", "rank", "episodes")]
+_ELSEWHERE = "elsewhere"
+_FACTS = [
+    field.name for field in fields(Certified) if field.name not in (*_POLICY, _ELSEWHERE, "number", "rank", "episodes")
+]
+_FACTS_ELSEWHERE = [field.name for field in fields(Elsewhere) if field.name != "episodes"]
 
 
 def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """(facts, arrays) of a certified policy, as they are stored."""
     facts = {name: getattr(policy, name) for name in _FACTS}
-    return facts, {name: getattr(policy, name) for name in _POLICY} | arrays_of(policy.episodes)
+    arrays = {name: getattr(policy, name) for name in _POLICY} | arrays_of(policy.episodes)
+    if (there := policy.elsewhere) is not None:
+        facts[_ELSEWHERE] = {name: getattr(there, name) for name in _FACTS_ELSEWHERE}
+        arrays |= {f"{_ELSEWHERE}_{name}": array for name, array in arrays_of(there.episodes).items()}
+    return facts, arrays
 
 
-_HINTS = get_type_hints(Certified)
-_Facts = create_model("_Facts", __base__=Form, **{name: (_HINTS[name], ...) for name in _FACTS})  # type: ignore[call-overload]
-_NEEDED = {
-    **dict.fromkeys((*_POLICY, "return_E", "last_reward_E", "goal_distance_E", "descriptor_E_B"), REAL),
+def _form(kind: type, names: Sequence[str], **more: Any) -> Any:
+    hints = get_type_hints(kind)
+    return create_model(f"_{kind.__name__}", __base__=Form, **{name: (hints[name], ...) for name in names}, **more)
+
+
+_FactsElsewhere = _form(Elsewhere, _FACTS_ELSEWHERE)
+_Facts = _form(Certified, _FACTS, elsewhere=(_FactsElsewhere | None, None))
+_EPISODES = {
+    **dict.fromkeys(("return_E", "last_reward_E", "goal_distance_E", "descriptor_E_B"), REAL),
     "steps_E": INTEGER,
 }
+_NEEDED = {**dict.fromkeys(_POLICY, REAL), **_EPISODES}
 _MORE = {"success_E": BOOL}
 
 
 def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     """A certified policy of the store. Raises StoreError if it is none of a run of these sizes."""
-    lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions}
-    found = array_problem(row.arrays, _NEEDED, _MORE, lengths)
+    prefix = f"{_ELSEWHERE}_"
+    arrays: dict[str, Any] = {name: array for name, array in row.arrays.items() if not name.startswith(prefix)}
+    there: dict[str, Any] = {
+        name.removeprefix(prefix): array for name, array in row.arrays.items() if name.startswith(prefix)
+    }
     older = {"decides": None if row.facts.get("candidates") == 1 else False, "tries": 0}
     facts = {**older, **row.facts}
+    lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions}
+    found = array_problem(arrays, _NEEDED, _MORE, lengths)
+    if not found and facts.get(_ELSEWHERE) is not None:  # its descriptor has other dimensions
+        found = array_problem(there, _EPISODES, _MORE, {"E": lengths["E"]})
+    elif not found and there:
+        found = f"has an array {prefix + min(there)!r} of no other task"
     try:
         require_form(facts, _Facts, "its facts")
     except Damaged as error:
@@ -280,11 +334,12 @@ def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     if found or not lengths["E"]:
         which = f"row {row.rank} of certification {row.number}"
         raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
-    arrays: dict[str, Any] = {"success_E": None, **row.arrays}
     own = {name: arrays.pop(name) for name in _POLICY} | {name: facts[name] for name in _FACTS}
-    return Certified(row.number, row.rank, **own, episodes=Episodes(**arrays))
+    if (known := facts.get(_ELSEWHERE)) is not None:
+        known = {name: known[name] for name in _FACTS_ELSEWHERE}
+        own[_ELSEWHERE] = Elsewhere(**known, episodes=_episodes(there))
+    return Certified(row.number, row.rank, **own, episodes=_episodes(arrays))
 
 
-def _interval(name: str, values_E: NDArray[np.float64] | None) -> dict[str, float | None]:
-    ends = (None, None, None) if values_E is None else mean_interval(values_E)
-    return dict(zip((f"{name}_mean", f"{name}_low", f"{name}_high"), ends, strict=True))
+def _episodes(arrays: Mapping[str, Any]) -> Episodes:
+    return Episodes(**{"success_E": None, **arrays})

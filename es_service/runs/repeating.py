@@ -47,9 +47,12 @@ def why_not_repeatable(run: Run, config: RunConfig) -> str:
 
     Empty if it repeats itself, as far as can be found, and for tasks in JAX.
     """
+    return run.meta.task.get("does_not_repeat") or why_task_does_not_repeat(config)
+
+
+def why_task_does_not_repeat(config: RunConfig) -> str:
+    """As `why_not_repeatable`, for the task of a config as it is examined now."""
     task = task_of(config)
-    if recorded := run.meta.task.get("does_not_repeat"):
-        return recorded
     if task.kind not in ("python", "function"):
         return ""
     options = config.task.options

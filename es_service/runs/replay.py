@@ -24,7 +24,6 @@ from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import FloatArray
-from es_service.protocol.noise import Domain
 from es_service.protocol.parent import answer_of
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.certified import newest_certified
@@ -116,7 +115,8 @@ def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Can
     episode = int(np.argsort(fitness_E, kind="stable")[(fitness_E.size - 1) // 2])
     candidate = Candidate(CERTIFIED, policy, certified.number, float(fitness_E.mean()))
     centre = centre_of(policy, certified.number)
-    request = RecordRequest(centre, config.seed, policy=0, episode=episode, domain=Domain.CERTIFICATION_RESET)
+    seed, domain = certified.resets(config.seed)
+    request = RecordRequest(centre, seed, policy=0, episode=episode, domain=domain)
     changes = tuple(changes_since(certified.platform, now))
     return candidate, StoredEpisode(request, float(fitness_E[episode]), None, changes, certified.number)
 

@@ -8,20 +8,72 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.episodes import part_of
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, FloatArray, Work
 from es_service.protocol.noise import Domain
-from es_service.runs.certified import Episodes, Measure
+from es_service.runs.intervals import mean_interval, share_interval
 
 FIRST_EPISODES = 16
 """Selection episodes of each candidate in the first round; each later round has twice as many as the one before."""
 Parameters = tuple[FloatArray, FloatArray, FloatArray]
 """A policy to run: its parameters [D], and mean and standard deviation of its observations, [O] each."""
+
+
+Measure = Literal["return", "last_reward", "success", "goal_distance"]
+"""What selection episodes rank by; the least goal distance ranks by its negative, since higher is better."""
+MEASURES: tuple[Measure, ...] = get_args(Measure)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What is kept of episodes of a policy, whatever the run's `task.fitness` is."""
+
+    return_E: NDArray[np.float64]
+    """Sum of the rewards."""
+    last_reward_E: NDArray[np.float64]
+    """Reward of the last valid step."""
+    goal_distance_E: NDArray[np.float64]
+    """Least distance to the goal along the episode; NaN if the task has no goal."""
+    success_E: NDArray[np.bool_] | None
+    """Whether the episode succeeded; None if the task does not declare success."""
+    steps_E: NDArray[np.int64]
+    descriptor_E_B: NDArray[np.float64]
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all episodes."""
+        return int(self.steps_E.sum())
+
+    @property
+    def count(self) -> int:
+        """Number of episodes."""
+        return self.return_E.size
+
+    def fitness(self, kind: str) -> NDArray[np.float64]:
+        """Fitness of each episode, [E]; `kind` is `task.fitness`."""
+        return self.return_E if kind == "sum" else self.last_reward_E
+
+    def mean_fitness(self, kind: str) -> float:
+        """Mean of `fitness`."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return float(self.fitness(kind).mean())
+
+    def values(self) -> dict[str, float | int | None]:
+        """Means with their intervals, and successes, by column name; None for what the task does not have."""
+        columns: dict[str, float | int | None] = {}
+        for name, values_E in (("return", self.return_E), ("last_reward", self.last_reward_E)):
+            columns |= _interval(name, values_E)
+        columns |= _interval("goal_distance", None if np.isnan(self.goal_distance_E).all() else self.goal_distance_E)
+        successes = None if self.success_E is None else int(self.success_E.sum())
+        low, high = (None, None) if successes is None else share_interval(successes, self.count)
+        return columns | {"successes": successes, "success_low": low, "success_high": high}
 
 
 @dataclass(frozen=True)
@@ -82,7 +134,14 @@ def halved(
 def new_episodes(
     engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
 ) -> list[Episodes]:
-    """What is kept of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
+    """What is kept of new episodes of each policy; arguments as of `results_of`."""
+    return [kept(result) for result in results_of(engine, policies, episodes, seed, number, ask, domain)]
+
+
+def results_of(
+    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
+) -> list[EpisodesResult]:
+    """Results [E] of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
     number, ask) determines."""
     asked = [
         policy_work(
@@ -99,10 +158,10 @@ def new_episodes(
     work: list[Work] = [subject_chunk for each in asked for subject_chunk in each.work]
     answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
     results = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
-    return [_kept(part_of(result, 0)) for result in results]
+    return [part_of(result, 0) for result in results]
 
 
-def _kept(result: EpisodesResult) -> Episodes:
+def kept(result: EpisodesResult) -> Episodes:
     """What is kept of the results [E] of a policy."""
     return Episodes(
         result.returns.astype(np.float64),
@@ -112,3 +171,12 @@ def _kept(result: EpisodesResult) -> Episodes:
         result.steps.astype(np.int64),
         result.descriptor.astype(np.float64),
     )
+
+
+def _interval(name: str, values_E: NDArray[np.float64] | None) -> dict[str, float | None]:
+    return interval_columns(name, None if values_E is None else mean_interval(values_E))
+
+
+def interval_columns(name: str, interval: tuple[float, float, float] | None) -> dict[str, float | None]:
+    """A mean and the ends of its interval by column name."""
+    return dict(zip((f"{name}_mean", f"{name}_low", f"{name}_high"), interval or (None, None, None), strict=True))

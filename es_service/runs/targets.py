@@ -22,7 +22,6 @@ from es_service.runs.certification import Named, add_certified, different, opene
 from es_service.runs.certified import (
     EPISODES,
     Certified,
-    Episodes,
     all_certifications,
     decisions,
     measure_of,
@@ -30,7 +29,7 @@ from es_service.runs.certified import (
     report_of,
 )
 from es_service.runs.evaluation import candidates
-from es_service.runs.selection import Parameters, new_episodes
+from es_service.runs.selection import Episodes, Parameters, new_episodes
 from es_service.runs.view import open_run
 
 BEST = "best"

@@ -60,17 +60,19 @@ def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None
 
 
 def rows(
-    connection: sqlite3.Connection, newest: Callable[[Mapping[str, Any]], bool] | None = None
+    connection: sqlite3.Connection, newest: Callable[[Mapping[str, Any]], bool] | None = None, holding: str = ""
 ) -> list[tuple[Key, CertifiedRow | None]]:
     """The rows that were not removed, in the order of number and rank; None for the content of a damaged one.
 
     Args:
         newest: facts of a row -> whether it is wanted; then only the rows of the newest certification that has wanted
             or damaged ones.
+        holding: a text that the facts of a row must have as JSON; the payload of others is not read.
     """
     row_list: list[tuple[Key, CertifiedRow | None]] = []
-    query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number"
-    for number, rank, text, payload, sha256 in connection.execute(f"{query} {'DESC' if newest else ''}, rank"):
+    query = "SELECT number, rank, facts, payload, sha256 FROM certification WHERE ? = '' OR instr(facts, ?)"
+    order = f"ORDER BY number {'DESC' if newest else ''}, rank"
+    for number, rank, text, payload, sha256 in connection.execute(f"{query} {order}", (holding, holding)):
         if newest and row_list and row_list[0][0][0] != number:
             break
         if not isinstance(payload, bytes) or _sha256(number, rank, text, payload) != sha256:

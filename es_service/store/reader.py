@@ -194,12 +194,14 @@ def next_certification(folder: Path) -> int:
         return certifications.next_number(connection, meta.parent)
 
 
-def read_certifications(folder: Path, newest: Callable[[Mapping[str, Any]], bool] | None = None) -> list[CertifiedRow]:
+def read_certifications(
+    folder: Path, newest: Callable[[Mapping[str, Any]], bool] | None = None, holding: str = ""
+) -> list[CertifiedRow]:
     """All certified policies, in the order of certification and rank; with `newest`, those of the last certification
-    whose facts are wanted."""
+    whose facts are wanted, and with `holding`, those whose facts have this text as JSON."""
     with reading(folder) as (connection, _):
         rows = []
-        for (number, rank), row in certifications.rows(connection, newest):
+        for (number, rank), row in certifications.rows(connection, newest, holding):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} is damaged")
             rows.append(row)

@@ -18,9 +18,10 @@ from es_service.store.facts import Damaged, RunFacts, column_problem, facts, req
 
 SCHEMA = "schema_version"
 """Record of the table `meta` with the schema version."""
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 OLDEST_VERSION = 6
-"""Oldest schema version that is read and continued. In 6, a certification does not say whether it decided something."""
+"""Oldest schema version that is read and continued. In 6, a certification does not say whether it decided something;
+before 8, none has episodes in another task."""
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256

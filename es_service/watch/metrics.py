@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from es_service.errors import ServiceError
 from es_service.runs.recent import FAULTS_OF, read_recent
@@ -22,6 +23,8 @@ OTHERS = {
     "running": "Whether a driver is writing.",
     "readable": "Whether the run can be read.",
     "certified_fitness": "Mean fitness, in certified episodes, of the policy that the newest certification put first.",
+    "certified_elsewhere_fitness": "The same in the other task that the label elsewhere names.",
+    "certified_gap": "Mean fitness there minus that of the same policy in the task of the run.",
     "lost_workers": f"Workers lost in the newest {FAULTS_OF} generations.",
     "retries": f"Chunks sent again in the newest {FAULTS_OF} generations.",
 }
@@ -37,10 +40,15 @@ def metrics(summaries: Iterable[Summary]) -> str:
         if summary.status is not None:
             constants = summary.status.run.constants
             labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
-        shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labels.items())
-        for name, value in numbers.items():
-            if math.isfinite(value):
-                values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
+        lines = [(labels, numbers)]
+        lines += [
+            (labels | {"elsewhere": task}, _elsewhere(one.row(), summary)) for task, one in summary.elsewhere.items()
+        ]
+        for labelled, of in lines:
+            shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labelled.items())
+            for name, value in of.items():
+                if math.isfinite(value):
+                    values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
     about = {name: text for name, (_, text) in GAUGES.items()} | OTHERS
     return "".join(
         f"# HELP {PREFIX}{name} {about[name]}\n# TYPE {PREFIX}{name} gauge\n{''.join(lines)}"
@@ -66,6 +74,12 @@ def _values(summary: Summary) -> Mapping[str, float]:
         if recent.problem is None:
             numbers |= {"lost_workers": float(recent.lost_workers), "retries": float(recent.retries)}
     return numbers
+
+
+def _elsewhere(row: Mapping[str, Any], summary: Summary) -> Mapping[str, float]:
+    """The numbers of a policy that was certified in another task."""
+    columns = {"certified_elsewhere_fitness": "elsewhere", "certified_gap": "gap"}
+    return {name: row[f"{prefix}_{summary.measure}_mean"] for name, prefix in columns.items()}
 
 
 def _escaped(text: str) -> str:

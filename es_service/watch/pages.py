@@ -10,7 +10,7 @@ from typing import Any
 from es_service.errors import ServiceError, counted
 from es_service.report.compare_page import comparison_sections
 from es_service.report.data import RunData
-from es_service.report.facts import number
+from es_service.report.facts import elsewhere_text, number
 from es_service.report.maps import empty_pattern
 from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
@@ -88,14 +88,15 @@ def _cells(summary: Summary) -> list[Markup]:
         of = {key: f" of {short(limit)}" for key, limit in limits.items()}
         best = number(row["best_fitness"]) if row else ""
         value, policy = summary.certified_fitness, summary.certified
-        certified = "" if value is None or policy is None else f"{number(value)} ({policy.title})"
+        certified = [] if value is None or policy is None else [f"{number(value)} ({policy.title})"]
+        certified += [f"{task}: {elsewhere_text(of, summary.measure)}" for task, of in summary.elsewhere.items()]
         share = row.get("coverage")
         coverage = "" if share is None else f"{100 * share:.1f} %"
         values = [
             box, link, state(status),
             f"{row['generation']:,}{of.get('generations', '')}" if row else "",
             f"{short(row['env_steps'])}{of.get('env_steps', '')}" if row else "",
-            _short(row.get("steps_per_second")), best, certified, coverage,
+            _short(row.get("steps_per_second")), best, "; ".join(certified), coverage,
             constants["task.environment"], constants["search.algorithm"], constants["seed"],
         ]  # fmt: skip
     return [tag("td", value, data_head=head) for head, value in zip(HEADS, values, strict=True)]

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 
 from es_service.errors import ServiceError, StoreError
 from es_service.report.data import RunData, followed, run_data
-from es_service.runs.certified import Certified, newest_certified
+from es_service.runs.certified import Certified, certified_elsewhere, measure_of, newest_certified
 from es_service.runs.run_status import RunStatus, read_status
+from es_service.runs.selection import Measure
 from es_service.runs.view import open_run
 from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run, leads_out
 from es_service.store.lock import lock_holder
@@ -49,8 +50,16 @@ class Summary(NamedTuple):
     found: Found
     status: RunStatus | None
     certified: Certified | None
+    elsewhere: Mapping[str, Certified]
+    """Title of another task -> the certified policy in it."""
     problem: str
     """Why it cannot be read; empty if it can."""
+
+    @property
+    def measure(self) -> Measure:
+        """What `task.fitness` says of an episode of a run that can be read."""
+        assert self.status is not None
+        return measure_of(self.status.run.constants["task.fitness"])
 
     @property
     def certified_fitness(self) -> float | None:
@@ -152,10 +161,10 @@ def _summary(run: Found) -> Summary:
     try:
         require_inside(run)
         status = read_status(open_run(run.folder))
-        certified = newest_certified(run.folder)
+        certified, elsewhere = newest_certified(run.folder), certified_elsewhere(run.folder)
     except ServiceError as error:
-        return Summary(run, None, None, " ".join(error.sentence.split()))
-    return Summary(run, status, certified, "")
+        return Summary(run, None, None, {}, " ".join(error.sentence.split()))
+    return Summary(run, status, certified, elsewhere, "")
 
 
 def _below(root: Path) -> Iterator[Found]:

@@ -88,6 +88,8 @@ def test_a_run_with_each_kind_of_policy_is_resumed_verified_replayed_exported_an
     place = tuple(int(n) for n in run.map[["cell_x", "cell_y"]].iloc[-1])
     replays, _ = record(run, best=True, cells=[place])
     assert all(one.is_the_stored for one in replays)
+    [elsewhere] = certify_run(run.folder, top=0, episodes=16, task="point_maze", on_notice=print)
+    assert elsewhere.row()["gap_return_mean"] == 0.0, "it is the run's own task, with the same starts"
     export(run, "npz", tmp_path / "out")
     policy, observations = run.policy("best"), np.array([[0.1, -0.8], [0.3, 0.2]], np.float32)
     act = policy.start()

@@ -142,6 +142,7 @@ def episode(
     named = {
         "success": np.bool_(done),
         "last_reward": np.float32(rewards[-1]),
+        "first_observation": places_T_B[0],
         "last_observation": places_T_B[-1],
         "observation": padded(seen),
         "action": padded(actions),

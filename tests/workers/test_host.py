@@ -197,6 +197,8 @@ def test_outputs_of_steps_are_what_happened_in_training_and_in_evaluations(episo
         place_K = steps["observation"][:, 0]
         starts_K = steps["observation"][:, 2] == 0.0
         assert starts_K.sum() == (8 * episodes if isinstance(chunk, TrainingChunk) else 5)
+        if starts_K.sum() == len(found.outputs["first_observation"]):
+            np.testing.assert_array_equal(found.outputs["first_observation"], steps["observation"][starts_K])
         np.testing.assert_array_equal(steps["step_descriptor"][:-1, 0][~starts_K[1:]], place_K[1:][~starts_K[1:]])
         np.testing.assert_allclose(steps["reward"], -np.abs(steps["step_descriptor"][:, 0]), rtol=1e-6)
         np.testing.assert_array_equal(steps["done"], np.abs(steps["step_descriptor"][:, 0]) > 3.0)

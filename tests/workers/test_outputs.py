@@ -79,7 +79,7 @@ def evaluated(worker_spec: WorkerSpec) -> tuple[EpisodesResult, Transitions]:
 
 def test_transitions_are_the_steps_of_the_task(spec):
     """Each episode again by the task's own functions, from its reset with the actions that it had."""
-    short = spec(episode_steps=30, outputs=TRANSITIONS)
+    short = spec(episode_steps=30, outputs=("first_observation", *TRANSITIONS))
     result, found = evaluated(short)
     task = environment_of("point_maze")
     step, observe = jax.jit(jax.vmap(task.step)), jax.jit(jax.vmap(task.observe))
@@ -97,6 +97,7 @@ def test_transitions_are_the_steps_of_the_task(spec):
         np.testing.assert_allclose(found.reward[at], np.asarray(rewards)[goes_on], atol=1e-5)
         np.testing.assert_array_equal(found.done[at], np.asarray(done)[goes_on])
         np.testing.assert_allclose(found.descriptor[at], np.asarray(states)[goes_on], atol=1e-6)
+    np.testing.assert_array_equal(result.outputs["first_observation"].reshape(-1, 2), found.observation[first])
     last = first + result.steps.reshape(-1) - 1
     np.testing.assert_array_equal(found.descriptor[last], result.descriptor.reshape(-1, 2))
     np.testing.assert_array_equal(found.last_observation.reshape(-1, 2), result.descriptor.reshape(-1, 2))

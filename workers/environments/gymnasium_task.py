@@ -38,6 +38,7 @@ from workers.environments.host_task import (
     LENGTH,
     SUCCESS_OF_INFO,
     HostTask,
+    action_bounds,
     chosen,
     length,
     said_success,
@@ -92,6 +93,7 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
         success=SUCCESS_OF_INFO if IS_SUCCESS in told else "",
         kind="python",
         discrete_actions=_is(actions, "Discrete"),
+        action_bounds=() if _is(actions, "Discrete") else action_bounds(_pairs(actions), size),
     )
 
 
@@ -186,7 +188,7 @@ def _acted(task: str, space: Any) -> Callable[[Any], Any]:
     """Function from actions of a policy [L, A] to actions of an environment."""
     if _is(space, "Box"):
         _size(task, "actions", space)
-        bounded = within_bounds(np.stack([space.low.reshape(-1), space.high.reshape(-1)], axis=-1), space.dtype)
+        bounded = within_bounds(_pairs(space), space.dtype)
         return lambda action_L_A: bounded(action_L_A).reshape(-1, *space.shape)
     if _is(space, "Discrete"):
         first = int(space.start)
@@ -195,6 +197,11 @@ def _acted(task: str, space: Any) -> Callable[[Any], Any]:
         f"{task} has actions of the space {space}; Box and Discrete are supported. Register the environment with a "
         "wrapper that takes one of these, such as gymnasium.wrappers.TransformAction"
     )
+
+
+def _pairs(box: Any) -> Any:
+    """(low, high) of each number of a Box."""
+    return np.stack([box.low.reshape(-1), box.high.reshape(-1)], axis=-1)
 
 
 def _size(task: str, what: str, box: Any) -> int:

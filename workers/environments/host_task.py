@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import FloatArray
+from es_service.protocol.messages import Bounds, FloatArray
 from es_service.protocol.raised import raised
 from workers.environments import TaskError
 
@@ -95,6 +95,8 @@ class HostEnvironment:
         self._require_arguments("reset", "an argument named seed", seed=0)
         self._require_arguments("step", "an action", 0)
         self._episode = HostEpisode(self._object, np.zeros(0, np.float32))
+        self.first_observation_O = self._episode.observation_O
+        """Observation [O] with which the present episode began."""
 
     def reset(self, seed: int) -> FloatArray:
         """Start an episode, and return its first observation [O]."""
@@ -102,6 +104,7 @@ class HostEnvironment:
         observation, info = result if _is_pair(result) else (result, {})
         self._require_info("reset", info)
         self._episode = HostEpisode(self._object, self._observed("reset", observation), info, dict(info))
+        self.first_observation_O = self._episode.observation_O
         if self._task.keeps_all:
             self._episode.observations.append(self._episode.observation_O)
         return self._episode.observation_O
@@ -255,6 +258,19 @@ def within_bounds(bounds: Any, dtype: Any = np.float32) -> Callable[[FloatArray]
     nearest = np.rint if np.issubdtype(dtype, np.integer) else np.asarray
     between = partial(np.clip, a_min=np.array(least_A, np.float64), a_max=np.array(most_A, np.float64))
     return lambda action_L_A: between(nearest((middle_A + half_A * action_L_A).astype(np.float64))).astype(dtype)
+
+
+def action_bounds(bounds: Any, size: int) -> Bounds:
+    """What -1 and 1 become by `within_bounds`, for each of `size` dimensions; empty if they stay -1 and 1.
+
+    The numbers are those of their texts, since -0.4 in float32 is -0.4000000059604645.
+    """
+    pairs_A_2 = np.broadcast_to(np.asarray(bounds).reshape(-1, 2), (size, 2))
+    pairs = [
+        (float(str(low)), float(str(high))) if np.isfinite([low, high]).all() else (-1.0, 1.0)
+        for low, high in pairs_A_2
+    ]
+    return () if set(pairs) == {(-1.0, 1.0)} else tuple(pairs)
 
 
 def chosen(action_L_A: FloatArray) -> list[int]:

@@ -24,6 +24,7 @@ from es_service.protocol.options import Option, OptionValue, choice
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import quietly
 from workers.environments.gymnasium_task import gymnasium_package
+from workers.environments.host_task import action_bounds
 from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, GymState, GymTask, Parts, Simulated
 from workers.environments.mujoco_parts import MjModel, forward, mujoco, mujoco_viewer, put_model, start, step_and_look
 
@@ -66,6 +67,7 @@ def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
             **{key: _option(value) for key, value in _defaults(task).items()},
         },
         descriptors=descriptors,
+        action_bounds=action_bounds(model.actuator_ctrlrange, model.nu),
         summary=f"{name} of Gymnasium, computed by MJX",
     )
 

@@ -53,6 +53,7 @@ from workers.environments.host_task import (
     LENGTH,
     SUCCESS_OF_INFO,
     HostTask,
+    action_bounds,
     chosen,
     length,
     said_success,
@@ -115,7 +116,13 @@ def describe(
         names, bounds = describe_descriptor(made, descriptor, no_bounds, task.action_size)
         spec = replace(spec, descriptor_names=names, descriptor_bounds=bounds)
     notes = unknown_attributes(name, task, KNOWN)
-    return replace(spec, discrete_actions=bool(getattr(task, "discrete_actions", False)), notes=notes)
+    limits = getattr(task, "action_bounds", None)
+    return replace(
+        spec,
+        discrete_actions=bool(getattr(task, "discrete_actions", False)),
+        action_bounds=() if limits is None else action_bounds(limits, task.action_size),
+        notes=notes,
+    )
 
 
 def descriptor_of(task: Any) -> tuple[Any, Any]:

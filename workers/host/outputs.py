@@ -46,6 +46,7 @@ def _observation(spec: WorkerSpec, task: HostTask) -> tuple[int, ...]:
 OUTPUTS: Mapping[str, Output] = {
     "success": Output(_scalar, bool, lambda step: step.environment.success()),
     "last_reward": Output(_scalar, np.float32, lambda step: step.reward),
+    "first_observation": Output(_observation, np.float32, lambda step: step.environment.first_observation_O),
     "last_observation": Output(_observation, np.float32, lambda step: step.observation_O),
     "observation": Output(_observation, np.float32, lambda step: step.before_O),
     "action": Output(lambda spec, task: (spec.policy.widths[-1],), np.float32, lambda step: step.action_A),

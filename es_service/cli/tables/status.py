@@ -8,11 +8,11 @@ from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
-from es_service.cli.tables.certified import certified_line
+from es_service.cli.tables.certified import certified_line, elsewhere_line
 from es_service.errors import StoreError, counted
 from es_service.loop.history import evaluated_nouns
 from es_service.report.progress import plain_line
-from es_service.runs.certified import failed_sentence, newest_certified
+from es_service.runs.certified import certified_elsewhere, failed_sentence, newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.run_status import (
     RunStatus,
@@ -165,12 +165,13 @@ def _objectives(run: Run, recent: Recent) -> dict[str, str]:
 
 
 def _certified(run: Run) -> dict[str, str]:
-    """The policy of the newest certification, if there is one."""
+    """The policy of the newest certification, and those of the newest ones in other tasks, if there are any."""
     try:
-        policy = newest_certified(run.folder)
+        newest, elsewhere = newest_certified(run.folder), certified_elsewhere(run.folder)
     except StoreError as error:
         return {"certified": f"not known: {error.sentence}"}
-    return {} if policy is None else {"certified": f"{policy.title}: {certified_line(policy.row())}"}
+    fields = {} if newest is None else {"certified": f"{newest.title}: {certified_line(newest.row())}"}
+    return fields | {f"in {task}": f"{one.title}: {elsewhere_line(one.row())}" for task, one in elsewhere.items()}
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:

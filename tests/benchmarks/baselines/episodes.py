@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.noise import Domain, evaluation_reset_keys
 from es_service.runs.certification import EPISODES, OTHER_PROGRAMS
-from es_service.runs.certified import Episodes
+from es_service.runs.selection import Episodes
 from workers.lanes import Lanes
 
 Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 import es_service
 from es_service.protocol.machine import cpu_kind
 from es_service.runs.certification import EPISODES
-from es_service.runs.certified import Episodes
+from es_service.runs.selection import Episodes
 
 CHECKPOINT_S = 600.0
 """CPU seconds between checkpoints."""
