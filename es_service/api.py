@@ -10,8 +10,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.loading import Source
+from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
@@ -143,7 +142,7 @@ def resume(
         # The whole file, unlike `Run.present_config`: a constant that was edited there must be refused, not ignored.
         recorded = store.folder / CONFIG
         source = recorded if recorded.exists() else store.meta.config
-        return changed_config(source, overrides)
+        return changed_config(source, overrides, given=store.meta.given)
 
     overrides, asked = _with_values(overrides)
     listener = _listener(on_generation, on_notice, on_compile, progress, hook)

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.api import begin_or_resume
-from es_service.config.caller import CALLER
-from es_service.config.loading import Source
-from es_service.config.model import RunConfig, worker_spec
-from es_service.config.tasks import task_of
+from es_service.config.given import Source
+from es_service.config.model import RunConfig
+from es_service.config.tasks import CALLER, task_of
+from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
 from es_service.protocol.evaluator import Session
 from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec

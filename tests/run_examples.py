@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.loading import load_config
-from es_service.config.model import policy_spec
+from es_service.config.workload import policy_spec
 from es_service.loop.changes import changed_parts
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.loop.state import Best, RunState
@@ -24,6 +23,7 @@ from es_service.search.steps import fresh_state
 from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
+from tests.es_service.config_examples import load_config
 from workers.environments import SHIPPED
 from workers.rollouts import BACKENDS
 
@@ -53,6 +53,7 @@ def write_run(
         run_id=f"{config.seed:032x}",
         created="2025-01-01T00:00:00+00:00",
         config=config.model_dump(mode="json"),
+        given=dict(config.made.given),
         constants=config.constants(),
         task=asdict(task),
         columns=history_columns(task, enabled),

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from es_service.cli.options import ConfigArgument, SetOption, overrides
-from es_service.config.caller import CALLER
-from es_service.config.problems import one_of
+from es_service.config.tasks import CALLER
+from es_service.config.text import one_of
 from es_service.errors import ConfigError
 
 bench = typer.Typer(help="Measure the speed of this machine.", no_args_is_help=True)

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from es_service.config.fields import TASK_OPTIONS
-from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.options import options_of, read_options
-from es_service.config.problems import did_you_mean_task, one_of, problem_of
-from es_service.config.tasks import ROLLOUTS, TASKS
+from es_service.config.given import Overrides, parse_overrides
+from es_service.config.parts import TASK_OPTIONS
+from es_service.config.resolution import options_of
+from es_service.config.tasks import ROLLOUTS, TASKS, read_options
+from es_service.config.text import did_you_mean_task, one_of, problem_of
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.process_environment import child_environment

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from es_service.config.compute import implied_by
-from es_service.config.yaml_text import in_line
+from es_service.config.model import implied_by
+from es_service.config.text import in_line
 from es_service.errors import ServiceError, WayOut
 
 PROGRAM = "es-service"

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from es_service.config.presets import preset_table
-from es_service.config.shipped import shipped_configs
+from es_service.config.given import shipped_configs
+from es_service.config.search import preset_table
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.recent import Recent, read_recent
 from es_service.runs.run_status import RunStatus, state

@@ -18,8 +18,8 @@ import numpy as np
 from es_service.api import load_config
 from es_service.cli.data import print_json
 from es_service.cli.options import print_finding
-from es_service.config.model import worker_spec
 from es_service.config.tasks import TASKS
+from es_service.config.workload import worker_spec
 from es_service.dispatch.cluster_findings import Finding
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits

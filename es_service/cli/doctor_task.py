@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from es_service.config.problems import did_you_mean_task, one_of
 from es_service.config.tasks import TASKS
+from es_service.config.text import did_you_mean_task, one_of
 from es_service.dispatch.cluster_findings import Finding
 from es_service.errors import ConfigError, counted
 from es_service.protocol.messages import UNBOUNDED, TaskSpec

@@ -23,8 +23,7 @@ from es_service.cli.options import (
     print_note,
 )
 from es_service.cli.sweep import GridOption, ParallelOption, SeedsOption, grid_of, seeds_of
-from es_service.config.keys import parse_overrides
-from es_service.config.shipped import read_config
+from es_service.config.given import parse_overrides, read_config
 from es_service.errors import ConfigError
 from es_service.runs import jobs
 from es_service.runs.job_package import JobPackage, run_package, sweep_package

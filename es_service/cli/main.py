@@ -50,8 +50,8 @@ from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.verify import verify
 from es_service.cli.watch import watch
 from es_service.config.changes import again_with
-from es_service.config.keys import parse_overrides
-from es_service.config.parallel import parallel_sentence
+from es_service.config.given import parse_overrides
+from es_service.config.workload import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
 from es_service.logs import logger
 from es_service.protocol.machine import VERSION
@@ -100,7 +100,7 @@ def run(
         raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
-    print_config_notes(config, [(wanted, loaded)])
+    print_config_notes(config, [loaded])
     if loaded.compute.engine == "ray":  # on the cores of one machine it says nothing that helps
         with contextlib.suppress(SystemExit):  # rich's answer to a closed output
             print_line(console, parallel_sentence(loaded))

@@ -12,17 +12,13 @@ import typer
 
 from es_service.cli.commands import assignments, error_message
 from es_service.cli.console import console, errors, print_line
-from es_service.config.compute import implied_by
-from es_service.config.keys import Overrides
-from es_service.config.loading import kept, left_out
-from es_service.config.model import RunConfig
-from es_service.config.resolution import config_warnings
-from es_service.config.tasks import ROLLOUTS, TASKS, task_of
-from es_service.config.yaml_text import show
+from es_service.config.model import RunConfig, implied_by
+from es_service.config.tasks import ROLLOUTS, task_of
+from es_service.config.text import show
+from es_service.config.workload import config_warnings
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 from es_service.protocol.system import given_path
-from es_service.search.algorithms import ALGORITHMS
 
 ConfigArgument = Annotated[
     Path, typer.Argument(parser=given_path, help="YAML file, or the name of a shipped config.", show_default=False)
@@ -126,18 +122,18 @@ def print_error(error: ServiceError | str) -> None:
     print_note(f"error: {message}", style="red")
 
 
-def print_config_notes(source: Path, configs: Sequence[tuple[Overrides, RunConfig]]) -> None:
-    """Print what a user should know before a run about the config made from `source` with each of the overrides:
-    ignored keys, values that stay although another method has other defaults, and settings that are probably not
-    intended. What several configs have in common is printed once."""
+def print_config_notes(source: Path, configs: Sequence[RunConfig]) -> None:
+    """Print what a user should know before a run about configs made from `source` by overrides: ignored keys, values
+    that stay although another method has other defaults, and settings that are probably not intended. What several
+    configs have in common is printed once."""
     notes: dict[str, None] = {}
-    for wanted, config in configs:
-        foreign = left_out(source, wanted, ALGORITHMS)
-        for why in dict.fromkeys(foreign.values()):
-            keys = [key for key in foreign if foreign[key] == why]
+    for config in configs:
+        left_out = config.made.left_out
+        for why in dict.fromkeys(left_out.values()):
+            keys = [key for key in left_out if left_out[key] == why]
             notes[f"ignored {', '.join(keys)} of {source}, since {why}"] = None
         stays: dict[str, list[str]] = {}
-        for key, value in kept(source, wanted, tasks=TASKS, algorithms=ALGORITHMS).items():
+        for key, value in config.made.kept.items():
             words = f"{key} = {show(value.value)} (by default {show(value.default)})"
             stays.setdefault(value.why, []).append(words)
         for why, words in stays.items():

@@ -16,7 +16,7 @@ from es_service.cli.several import RunsArgument, is_single, of_each, problem_dat
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import NOT_STARTED, print_overview
 from es_service.cli.tables.status import follow_status, print_status
-from es_service.config.shipped import shipped_text
+from es_service.config.given import shipped_text
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.system import given_path

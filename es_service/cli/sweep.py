@@ -25,8 +25,8 @@ from es_service.cli.options import (
     print_note,
 )
 from es_service.cli.tables.sweep import show_sweep
-from es_service.config.keys import parse_overrides
-from es_service.config.yaml_text import split_values
+from es_service.config.given import parse_overrides
+from es_service.config.text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
 from es_service.protocol.system import given_path
 from es_service.runs.sweep import SweptRun, run_planned
@@ -106,7 +106,7 @@ def run_sweep(
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
     planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
-    print_config_notes(config, [(run.overrides, run.config) for run in planned])
+    print_config_notes(config, [run.config for run in planned])
     for note in left_out_notes(planned):
         print_note(f"note: {note}")
     try:

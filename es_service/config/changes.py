@@ -1,32 +1,17 @@
-"""Changes of a run's config: which values are derived from a changed key, and which changes resume or fork refuses."""
+"""Changes of a run's config: what it becomes, and which changes resume or fork refuses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from es_service.config.compute import implied_by
-from es_service.config.fields import TASK_OPTIONS, as_tuple
-from es_service.config.keys import FIELDS
-from es_service.config.methods import (
-    KIND,
-    Methods,
-    all_search_fields,
-    are_alike,
-    filled_in,
-    has_effect,
-    kinds_without,
-    method_problems,
-    only_centres,
-    parts_of,
-    search_fields,
-)
-from es_service.config.presets import preset_rows
-from es_service.config.resolution import LEFT_OPEN
-from es_service.config.search import SearchConfig
-from es_service.config.yaml_text import show
+from es_service.config.given import Overrides, Source
+from es_service.config.keys import FIELDS, Methods, kind_of
+from es_service.config.loading import Known, judge, parse
+from es_service.config.model import RunConfig, implied_by, is_constant
+from es_service.config.text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
 STATE_KEYS = (
@@ -49,43 +34,50 @@ STATE_KEYS = (
     "map.centroids",
 )
 """Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
-_CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}
-"""Keys of which a method has no default of its own."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
 """Keys that are used only when a run starts."""
-_SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
-_MAP = ("map.kind", "map.bounds", "map.cells", "map.centroids")
-DERIVED_KEYS = {
-    "task.environment": ("task.episode_steps", *_MAP, "map.qd_offset"),
-    "task.episode_steps": ("map.qd_offset",),
-    "task.fitness": ("map.qd_offset",),
-    f"{TASK_OPTIONS}descriptor": _MAP,
-    "task.descriptor": _MAP,
-    "map.kind": ("map.cells", "map.centroids"),
-    "policy.observation_normalization": ("policy.observation_clip",),
-    "policy.output": ("policy.action_noise",),
-    "search.algorithm": ("search.centres",),
-    "search.emitters": ("search.centres",),
-    "search.screened": ("search.centres",),
-    "search.pairs": _SHAPES,
-    "compute.chunk_pairs": _SHAPES[1:],
-}
-"""Key -> prefixes of the keys whose values are derived from it, unless they are set explicitly."""
 ABSENT = "(absent)"
 """Stands for the value of a constant that only the other run has."""
 
 
-def without_derived(values: Mapping[str, Any], wanted: Mapping[str, Any], algorithms: Methods) -> dict[str, Any]:
-    """Resolved values without those that are derived from a key which `wanted` is about to change."""
-    changed = [
-        key
-        for key in DERIVED_KEYS
-        if key in wanted
-        and wanted[key] != values.get(key)
-        and not (key == "search.algorithm" and are_alike(values.get(key), wanted[key], algorithms))
-    ]
-    derived = tuple(name for key in changed for name in DERIVED_KEYS[key])
-    return {key: value for key, value in values.items() if not key.startswith(derived)}
+def changed_config(
+    source: Source,
+    overrides: Overrides,
+    known: Known,
+    *,
+    given: Mapping[str, Any] | None = None,
+    name: str = "config",
+) -> RunConfig:
+    """The config of an existing run with some keys changed.
+
+    What the changes leave as it was keeps its resolved value, whatever the defaults of this version are. What they
+    change is resolved again from what was given: all values that differ between what is given and the same with the
+    changes, both resolved by this version. The caller checks whether the run may change in this way.
+
+    Args:
+        source: the resolved config, such as the run's own `config.yaml`. The run that `search.init_from` names need
+            not exist any more.
+        given: what the config of the run was made from, by dotted key; None: all that `source` says.
+        overrides, known, name: as for `read`.
+
+    Raises:
+        ConfigError: as for `load_config`.
+    """
+    parsed = parse(source, overrides, name)
+    if given is None:
+        given = parsed.file
+    others = {key: value for key, value in parsed.wanted.items() if not is_constant(key)}
+    if len(others) < len(parsed.wanted):
+        before, after = (
+            judge(parsed._replace(file=given, wanted=wanted), known, new=False).values.known()
+            for wanted in (others, parsed.wanted)
+        )
+        affected = {key for key in {**before, **after} if before.get(key, ABSENT) != after.get(key, ABSENT)}
+        file = {key: value for key, value in parsed.file.items() if key not in affected}
+        parsed = parsed._replace(file=file | {key: value for key, value in given.items() if key in affected})
+    reading = judge(parsed, known, new=False)
+    remain = {key: value for key, value in given.items() if key not in reading.left_out}
+    return replace(reading, given=remain | dict(parsed.wanted)).config()
 
 
 def does_not_fit(name: str, old: Any, new: Any, algorithms: Methods) -> bool:
@@ -93,103 +85,10 @@ def does_not_fit(name: str, old: Any, new: Any, algorithms: Methods) -> bool:
     return name in STATE_KEYS and not (name == "search.algorithm" and are_alike(old, new, algorithms))
 
 
-def foreign_keys(
-    values: Mapping[str, Any], wanted: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
-) -> dict[str, str]:
-    """Keys that go with the task, the algorithm or a part of a config, if `wanted` replaces that and what replaces it
-    does not use them, or an algorithm does not allow their values; each with a clause that says what is replaced.
-
-    Args:
-        settings: those of the method with `wanted`; None if it is not known.
-    """
-
-    def is_replaced(key: str) -> bool:
-        return key in wanted and wanted[key] != values.get(key)
-
-    foreign: dict[str, str] = {}
-    if is_replaced("task.environment"):
-        why = f"{wanted['task.environment']} replaces its task"
-        foreign |= {key: why for key in values if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
-    if settings is None:
-        return foreign
-    chosen = filled_in({**values, **wanted}, settings) | dict(values) | dict(wanted)
-    if other := is_replaced("search.algorithm"):
-        known = values if ":" in str(values.get("search.algorithm")) else all_search_fields(algorithms)
-        known = {*known, *settings.unused}
-        why = _replaces("search.algorithm", wanted["search.algorithm"])
-        foreign |= {key: why for key in values if key in known and not has_effect(key, settings)}
-        forbidden = [problem.field or "" for problem in method_problems(chosen, settings)]
-        forbidden += [derived for key in forbidden for derived in DERIVED_KEYS.get(key, ())]
-        foreign |= {key: why for key in values if key in forbidden}
-    for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
-        if other or is_replaced(kind):
-            why = _replaces(kind, chosen[kind])
-            own = [key for key in values if key.startswith(kind.removesuffix(KIND))]
-            foreign |= {key: why for key in own if kinds_without(key, chosen[kind], settings)}
-    return {key: why for key, why in foreign.items() if key not in wanted}
-
-
-def _replaces(key: str, value: Any) -> str:
-    return f"{value} replaces its {'algorithm' if key == 'search.algorithm' else key}"
-
-
-@dataclass(frozen=True)
-class KeptValue:
-    """A value that a config gives to a key, although what it was written for has been replaced."""
-
-    value: Any
-    default: Any
-    """What the key would have without it."""
-    replaced: str
-    """The key that overrides have changed: `search.algorithm`, or the kind of a part."""
-    by: str
-    """The value of that key now."""
-
-    @property
-    def why(self) -> str:
-        """What is replaced, as a clause."""
-        return _replaces(self.replaced, self.by)
-
-
-def kept_values(
-    values: Mapping[str, Any],
-    wanted: Mapping[str, Any],
-    settings: type[SearchConfig],
-    algorithms: Methods,
-    by_task: Mapping[str, Any],
-) -> dict[str, KeptValue]:
-    """Keys of a config that stay as they are although `wanted` replaces the method, or the kind of a part, for which
-    they were written, and that the new one has another default for.
-
-    Args:
-        settings: those of the method with `wanted`.
-        by_task: values that the task fills in.
-    """
-    given, before = {**values, **wanted}, filled_in(values, settings) | dict(values)
-    filled = dict(by_task) | filled_in({**by_task, **given}, settings)
-    methods = (settings, *(method.settings for method in algorithms.values()))
-    declared = {*search_fields(settings), *(row.key for method in methods for row in preset_rows(method))} - _CHOSEN
-    gone = foreign_keys(values, wanted, settings, algorithms)
-    kept: dict[str, KeptValue] = {}
-    for key in (key for key in values if key in declared and key not in wanted and key not in gone):
-        chosen_by = ("search.algorithm", f"{key.rpartition('.')[0]}.{KIND}")
-        replaced = [name for name in chosen_by if wanted.get(name, before.get(name)) != before.get(name)]
-        if replaced and has_effect(key, settings):
-            default = filled[key] if key in filled else _default_with(key, filled | given, settings)
-            if default != ABSENT and as_tuple(values[key]) not in (default, LEFT_OPEN.get(key, ABSENT)):
-                kept[key] = KeptValue(values[key], default, replaced[0], show(wanted[replaced[0]]))
-    return kept
-
-
-def _default_with(key: str, chosen: Mapping[str, Any], settings: type[SearchConfig]) -> Any:
-    """The default of a key with a method and the chosen kinds of its parts; ABSENT if it has none."""
-    if key == "search.centres":
-        return only_centres(chosen, settings) or settings.first_centres
-    part, _, leaf = key.rpartition(".")
-    kinds, kind = parts_of(settings).get(part, {}), chosen.get(f"{part}.{KIND}")
-    fields = kinds[kind].model_fields if isinstance(kind, str) and kind in kinds else {}
-    field = fields.get(leaf) or search_fields(settings).get(key)
-    return _default(key) if field is None else ABSENT if field.is_required() else field.default
+def are_alike(old: object, new: object, algorithms: Methods) -> bool:
+    """Whether two shipped methods are of one family, so that a fork may change from one to the other."""
+    families = [method.settings.family for name, method in algorithms.items() if name in (old, new)]
+    return old == new or (len(families) == 2 and families[0] == families[1] != "")
 
 
 def changed_constants(
@@ -205,7 +104,7 @@ def changed_constants(
     """
 
     def goes_with_another(name: str) -> bool:
-        chosen = ("search.algorithm", f"{name.rpartition('.')[0]}.{KIND}")
+        chosen = ("search.algorithm", kind_of(name))
         is_shared = name in old and name in new
         return name.startswith("search.") and not is_shared and any(old.get(key) != new.get(key) for key in chosen)
 

@@ -1,31 +1,26 @@
-"""The keys of a config: which exist, their values in a file or in overrides, and the problems of unknown ones."""
+"""The keys of a config: which there are with a method, and what is said of one that there is not.
+
+This layer knows no method by name. Who loads a config passes the registry of methods, `algorithms`, by name; each has
+its class of settings as the attribute `settings`. Iteration yields the shipped methods.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from functools import cache
+from typing import Any, Literal, Protocol, get_args
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
+from pydantic.fields import FieldInfo
 
-from es_service.config.compute import WorkerResources
-from es_service.config.fields import RESOURCES, TASK_OPTIONS
-from es_service.config.methods import (
-    KIND,
-    Methods,
-    all_search_fields,
-    kinds_without,
-    methods_with,
-    no_effect,
-    parts_of,
-    search_fields,
-)
-from es_service.config.model import RunConfig
-from es_service.config.problems import nearest, one_of, problem_of
+from es_service.config.model import RunConfig, WorkerResources
+from es_service.config.parts import RESOURCES, TASK_OPTIONS, Section
 from es_service.config.search import SearchConfig
-from es_service.config.yaml_text import in_line, parse_value, plain, show
+from es_service.config.text import nearest, one_of, problem_of, show
 from es_service.errors import Problem
-from es_service.protocol.policy_spec import PolicySpec
 
+KIND = "kind"
+"""Key of a part that says which one it is."""
 SECTIONS = {
     name: field.annotation
     for name, field in RunConfig.model_fields.items()
@@ -42,6 +37,8 @@ FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name 
 GROUPS = (*SECTIONS, TASK_OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
 """Names of sections and of groups inside sections, which hold keys and have no value. Those in `search` are not
 included: they belong to methods."""
+BUDGET = [name for name in FIELDS if name.startswith("budget.")]
+"""Keys of which at least one must be set."""
 ALIASES = {
     "population": "search.pairs",
     "popsize": "search.pairs",
@@ -59,117 +56,148 @@ RENAMED = {
     "search.top_pairs": "search.shaping.count",
 }
 """Name of a key before version 0.13 -> its present name. What was an option of a search is a key of `search`."""
-BUDGET = [name for name in FIELDS if name.startswith("budget.")]
-"""Keys of which at least one must be set."""
-
-
-def policy_of(values: Mapping[str, Any], observation_size: int, action_size: int) -> PolicySpec:
-    """The policy that values of a config make, by dotted key; keys that are missing have their defaults."""
-    names = ("hidden", "activation", "output", "bias", "memory")
-    hidden, activation, output, bias, memory = (
-        values.get(f"policy.{name}", FIELDS[f"policy.{name}"].default) for name in names
-    )
-    return PolicySpec((observation_size, *hidden, action_size), activation, output, bias, memory or 0)
-
-
-def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[Problem]]:
-    """Sort the keys of a nested mapping: (values by dotted key, names of groups that are not mappings, problems).
-
-    There is a problem for each key with a dot, and each group that is not a mapping. `key_problems` finds unknown keys.
-    """
-    values: dict[str, Any] = {}
-    unusable: set[str] = set()
-    problems: list[Problem] = []
-    for key, value in mapping.items():
-        name = f"{group}{key}"
-        if "." in str(key):
-            section, leaf = name.rsplit(".", 1)
-            problems.append(problem_of(name, value, f"a key in a file has no dots; write {leaf} inside {section}:"))
-        elif isinstance(value, Mapping) and (name in GROUPS or group == "search."):
-            below = sort_keys(value, f"{name}.")
-            values |= below[0]
-            unusable |= below[1]
-            problems += below[2]
-        elif name in GROUPS:
-            unusable.add(name)
-            problems.append(problem_of(name, value, _not_a_mapping(name, value)))
-        else:
-            values[name] = plain(value)
-    return values, unusable, problems
-
-
-def _not_a_mapping(group: str, value: object) -> str:
-    hint = f"indent its keys below `{_leaf(group)}:`, or delete the line to use the defaults"
-    return f"{show(value)} is not a mapping of keys; {hint}"
-
-
-def key_problems(
-    values: Mapping[str, Any], wanted: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
-) -> dict[str, Problem]:
-    """Key -> problem of each key that a config with this method cannot have.
-
-    Args:
-        values: all values of the config by dotted key, with the kind of each part.
-        wanted: those of them that overrides have set.
-        settings: those of the method; None if it is not known, which allows the keys of every method.
-    """
-    known = FIELDS | (search_fields(settings) if settings else all_search_fields(algorithms))
-    parts = {part: kinds for method in algorithms.values() for part, kinds in parts_of(method.settings).items()}
-    problems: dict[str, Problem] = {}
-    for key, value in values.items():
-        if key in known:
-            part = key.rpartition(".")[0]
-            if settings and (kinds := kinds_without(key, kind := values.get(f"{part}.{KIND}"), settings)):
-                what = f"{show(value)} has no effect with {part}.{KIND} = {kind}; leave it out"
-                problems[key] = problem_of(key, value, f"{what} (a key of kind {one_of(kinds)})")
-        elif not (key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2):
-            group = key in (*GROUPS, *parts)
-            if key in RENAMED or key.startswith(SEARCH_OPTIONS):
-                now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
-                problems[key] = problem_of(key, value, f"this key is now {now}", suggestion=now)
-            elif group and key in wanted:
-                first = next((known_key for known_key in known if known_key.startswith(f"{key}.")), f"{key}.NAME")
-                what = f"this is a section; set its keys one by one, such as {first}=..."
-                problems[key] = problem_of(key, value, what, suggestion=first)
-            elif group:
-                problems[key] = problem_of(key, value, _not_a_mapping(key, value))
-            elif methods_with(key, algorithms) and key.startswith("search."):
-                problems[key] = no_effect(key, value, values["search.algorithm"], algorithms)
-            else:
-                groups = GROUPS if isinstance(value, Mapping) else ()
-                problems[key] = _unknown_key(key, (*groups, *known), value)
-                if problems[key].suggestion is None:
-                    problems[key] = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
-    return problems
-
-
 MOST_NAMED = 16
 """Most keys that a message lists."""
 
-Overrides = Iterable[str] | Mapping[str, Any]
-"""Changes of a config: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
-mapping from key to value."""
+
+class HasSettings(Protocol):
+    """A method, as far as a config is concerned."""
+
+    @property
+    def settings(self) -> type[SearchConfig]:
+        """Its class of settings."""
+        ...
 
 
-def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]]:
-    """Values by dotted key, and a problem for each override that cannot be read. Its key need not exist."""
-    values: dict[str, Any] = {}
-    problems: list[Problem] = []
-    if isinstance(overrides, Mapping):
-        overrides = [f"{name}={in_line(plain(value))}" for name, value in overrides.items()]
-    for override in [overrides] if isinstance(overrides, str) else overrides:
-        name, equals, text = (part.strip() for part in override.partition("="))
-        where = f"override {override}"
-        if not equals or not name or not text:
-            example = "write KEY=VALUE, such as search.sigma=0.05"
-            hint = "the value is missing; write null for no value" if name and equals else example
-            problems.append(Problem(f"{where}: {hint}"))
+Methods = Mapping[str, HasSettings]
+
+
+@cache
+def parts_of(settings: type[SearchConfig]) -> dict[str, dict[str, type[Section]]]:
+    """Key of each part, such as search.step -> kind -> the class with its keys."""
+    return {
+        f"search.{name}": {section.model_fields[KIND].default: section for section in get_args(field.annotation)}
+        for name, field in settings.model_fields.items()
+        if field.discriminator == KIND
+    }
+
+
+@cache
+def search_fields(settings: type[SearchConfig]) -> dict[str, FieldInfo]:
+    """Dotted key -> field of each key that a method has, for parts those of every kind."""
+    fields: dict[str, FieldInfo] = {}
+    for name, field in settings.model_fields.items():
+        key = f"search.{name}"
+        kinds = parts_of(settings).get(key)
+        if kinds is None:
+            fields[key] = field
             continue
-        try:
-            values[name] = parse_value(text)
-        except ValueError as error:
-            problems.append(Problem(f"{where}: {error}", name, text))
-    return values, problems
+        fields[f"{key}.{KIND}"] = kind = Field(field.default.kind, description=field.description)
+        kind.annotation = Literal[tuple(kinds)]
+        for section in kinds.values():
+            for leaf, its in section.model_fields.items():
+                fields.setdefault(f"{key}.{leaf}", its)
+    return fields
+
+
+def all_search_fields(algorithms: Methods) -> dict[str, FieldInfo]:
+    """The fields of every shipped method, by key; of several with the same key, that of the first method."""
+    fields: dict[str, FieldInfo] = {}
+    for method in algorithms.values():
+        fields = search_fields(method.settings) | fields
+    return fields
+
+
+def has_effect(key: str, settings: type[SearchConfig]) -> bool:
+    """Whether a key of a config has an effect with a method."""
+    return key in search_fields(settings) if key.startswith("search.") else key not in settings.unused
+
+
+def methods_with(key: str, algorithms: Methods) -> tuple[str, ...]:
+    """The shipped methods with which a key has an effect."""
+    return tuple(name for name, method in algorithms.items() if has_effect(key, method.settings))
+
+
+def kind_of(key: str) -> str:
+    """The key that says of which kind the part is that has a key."""
+    return f"{key.rpartition('.')[0]}.{KIND}"
+
+
+def kinds_with(key: str, settings: type[SearchConfig]) -> tuple[str, ...]:
+    """The kinds of its part that have a key; none if it is no key of a part."""
+    part, _, leaf = key.rpartition(".")
+    return tuple(name for name, kind in parts_of(settings).get(part, {}).items() if leaf in kind.model_fields)
+
+
+def lacks(key: str, kind: object, settings: type[SearchConfig]) -> bool:
+    """Whether a kind of a part does not have a key that other kinds of the part have."""
+    known, kinds = parts_of(settings).get(key.rpartition(".")[0], {}), kinds_with(key, settings)
+    return isinstance(kind, str) and kind in known and bool(kinds) and kind not in kinds
+
+
+def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: Any = None) -> Problem:
+    """The problem of a key that has no effect with a method.
+
+    Args:
+        default: the value that the key has if it is left out, for one that every config has.
+    """
+    others = methods_with(key, algorithms)
+    whose = f" (a key of {one_of(others, 'and')})" if others else ""
+    what = f"{show(value)} has no effect with {method}; leave it out{whose}"
+    return problem_of(key, value, what, suggestion=default)
+
+
+def not_a_mapping(group: str, value: object) -> Problem:
+    """The problem of a section that has a value in place of keys."""
+    hint = f"indent its keys below `{_leaf(group)}:`, or delete the line to use the defaults"
+    return problem_of(group, value, f"{show(value)} is not a mapping of keys; {hint}")
+
+
+def key_problems(
+    given: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    values: Mapping[str, Any],
+    settings: type[SearchConfig] | None,
+    algorithms: Methods,
+) -> dict[str, Problem]:
+    """Key -> problem of each key that a config with this method, and these kinds of its parts, cannot have.
+
+    Args:
+        given: all values that the config gives, by dotted key.
+        wanted: those of them that overrides have set.
+        values: all values, with the kind of each part.
+        settings: those of the method; None if it is not known, which allows the keys of every method.
+    """
+    known = FIELDS | (search_fields(settings) if settings else all_search_fields(algorithms))
+    parts = {part for method in algorithms.values() for part in parts_of(method.settings)}
+
+    def problem(key: str, value: Any) -> Problem | None:
+        if key in known:
+            if not settings or not lacks(key, kind := values.get(kind_of(key)), settings):
+                return None
+            what = f"{show(value)} has no effect with {kind_of(key)} = {kind}; leave it out"
+            return problem_of(key, value, f"{what} (a key of kind {one_of(kinds_with(key, settings))})")
+        if key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2:
+            return None
+        if key in RENAMED or key.startswith(SEARCH_OPTIONS):
+            now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
+            return problem_of(key, value, f"this key is now {now}", suggestion=now)
+        if key in (*GROUPS, *parts):
+            if key not in wanted:
+                return not_a_mapping(key, value)
+            first = next((name for name in known if name.startswith(f"{key}.")), f"{key}.NAME")
+            return problem_of(
+                key, value, f"this is a section; set its keys one by one, such as {first}=...", suggestion=first
+            )
+        if key.startswith("search.") and methods_with(key, algorithms):
+            return no_effect(key, value, given["search.algorithm"], algorithms)
+        groups = GROUPS if isinstance(value, Mapping) else ()
+        unknown = _unknown_key(key, (*groups, *known), value)
+        if unknown.suggestion is None:
+            unknown = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
+        return unknown
+
+    return {key: found for key, value in given.items() if (found := problem(key, value))}
 
 
 def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:

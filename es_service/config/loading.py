@@ -1,332 +1,338 @@
 """Turns YAML and overrides into a `RunConfig`, or raises one error that lists everything that is wrong with them.
 
-The steps are: read, sort keys into sections, apply overrides, set keys without effect aside, fill in the preset, check
-each value alone, check names and options, resolve what is left open, check the sections against each other. A value
-that fails a step is reported once and removed, so that the later steps still check everything else.
+`read` looks at a config once: it sorts what is given by key, leaves out what overrides have replaced, checks each key
+and each value alone, finds the values of all other keys (`resolution.py`) and applies the rules (`rules.py`). What is
+invalid is reported once, as itself.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from types import FunctionType, NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from es_service.config.changes import KeptValue, foreign_keys, kept_values, without_derived
-from es_service.config.fields import TASK_OPTIONS, as_tuple
-from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
-from es_service.config.map_rules import map_problems
-from es_service.config.methods import (
+from es_service.config.given import Overrides, Source, by_key, nested, parse_overrides, read_config
+from es_service.config.keys import (
+    FIELDS,
     KIND,
     Methods,
     all_search_fields,
-    filled_in,
     has_effect,
-    kinds_without,
-    method_problems,
+    key_problems,
+    kind_of,
+    lacks,
     no_effect,
     parts_of,
     search_fields,
-    start_problems,
 )
-from es_service.config.model import RunConfig
-from es_service.config.objective_rules import objective_problems
-from es_service.config.options import options_of, read_options, settings_of_task
-from es_service.config.problems import meant_task, nearest, not_allowed, one_of, problem_of, wrong_value
-from es_service.config.resolution import (
-    LEFT_OPEN,
-    engine_problems,
-    hidden_problems,
-    is_idle,
-    policy_problems,
-    resolve,
-    rollout_problems,
-    shape_problems,
-    task_problems,
-    values_of_task,
-)
-from es_service.config.search import SearchConfig
-from es_service.config.shipped import read_config
-from es_service.config.start import folder_problems
-from es_service.config.tasks import Tasks
-from es_service.config.yaml_text import show
+from es_service.config.model import Kept, Made, RunConfig, replaces
+from es_service.config.parts import TASK_OPTIONS, as_tuple
+from es_service.config.resolution import LEFT_OPEN, Unknown, Values, asks
+from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of
+from es_service.config.search import SearchConfig, preset_rows
+from es_service.config.tasks import Tasks, read_options, settings_of_task
+from es_service.config.text import meant_task, nearest, not_allowed, one_of, problem_of, show, wrong_value
 from es_service.errors import ConfigError, Problem, counted
-from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.rollouts import Rollouts
+from es_service.protocol.system import given_path
 from es_service.protocol.user_code import in_no_file
 
-Source = str | os.PathLike[str] | Mapping[str, Any]
-"""Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
+NORMALISED, CLIP = "policy.observation_normalization", "policy.observation_clip"
+_CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}
+"""Keys of which a method has no default of its own."""
 
 
-def load_config(
+class Known(NamedTuple):
+    """What a config may name."""
+
+    tasks: Mapping[str, TaskSpec]
+    algorithms: Methods
+    """Methods by name, of which the first is the simplest."""
+    rollouts: Rollouts
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A config that has been read: its values, and everything that is wrong with them."""
+
+    name: str
+    """The file, or what an error calls a config that is none."""
+    given: Mapping[str, Any]
+    """What the config gives, by dotted key: values of the file, without those left out, and of overrides."""
+    wanted: Mapping[str, Any]
+    """Values of overrides."""
+    left_out: Mapping[str, str]
+    """See `Made.left_out`."""
+    kept: Mapping[str, Kept]
+    """See `Made.kept`."""
+    values: Values
+    problems: Sequence[Problem]
+    task: TaskSpec | None
+    settings: type[SearchConfig] | None
+
+    def config(self) -> RunConfig:
+        """The config.
+
+        Raises:
+            ConfigError: names the file, then lists every problem on a line of its own.
+        """
+        if self.problems or self.settings is None or self.task is None:
+            raise ConfigError.listing(f"{self.name}: {counted(len(self.problems), 'problem')}", self.problems)
+        sections = nested(self.values.known())
+        if isinstance(start := self.values["search.init_from"], str):
+            # An absolute path, so that the stored config names the same run from every working directory.
+            sections["search"]["init_from"] = os.path.abspath(given_path(start))
+        config = RunConfig.model_validate(sections | {"search": self.settings.model_validate(sections["search"])})
+        return config.made_of(Made(self.task, self.given, self.left_out, self.kept))
+
+    @cached_property
+    def idle(self) -> dict[str, str]:
+        """Keys of the overrides that the method, or the chosen kind of a part, does not have; each with the name of
+        that method or kind. None if the method is not known."""
+        if self.settings is None:
+            return {}
+        idle = {key: str(self.values["search.algorithm"]) for key in self.wanted if not has_effect(key, self.settings)}
+        for key in self.wanted.keys() - idle.keys():
+            if lacks(key, kind := self.values.get(kind_of(key)), self.settings):
+                idle[key] = f"{kind_of(key)} = {show(kind)}"
+        return idle
+
+
+def read(
     source: Source,
-    overrides: Overrides = (),
+    overrides: Overrides,
+    known: Known,
     *,
-    tasks: Mapping[str, TaskSpec],
-    algorithms: Methods,
-    rollouts: Rollouts,
     new: bool = True,
     searches: bool = True,
     name: str = "config",
-) -> RunConfig:
-    """Load the config of a new run.
+) -> Reading:
+    """Read a config.
 
     Args:
         source: a YAML file, the name of a shipped config, or a nested mapping with the content of one.
         overrides: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
             mapping from key to value. If they choose another task or algorithm, keys of the source that go with its
-            own one are dropped, and so are values that the chosen algorithm does not allow; `left_out` returns those.
-        tasks: the tasks that `task.environment` may name.
-        algorithms: the methods that `search.algorithm` may name, of which the first is the simplest.
-        rollouts: the rollouts that `compute.rollout` may name.
-        new: whether the run that `search.init_from` names, if any, must exist.
+            own one are left out, and so are values that the chosen algorithm does not allow.
+        new: whether a run is about to start with it; the run that `search.init_from` names must then exist.
         searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
         name: what an error calls a `source` that is no file.
 
     Raises:
-        ConfigError: names the file, then lists every problem on a line of its own.
+        ConfigError: the source cannot be read.
     """
-    defaults = {} if searches else {"search.algorithm": next(iter(algorithms)), "budget.generations": 1}
-    return _load(source, overrides, tasks, algorithms, rollouts, defaults, name, new=new, resolved=False)
+    return judge(parse(source, overrides, name), known, new=new, searches=searches)
 
 
-def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
-    """Keys that `load_config` drops because the overrides choose another task, algorithm or kind of a part, which does
-    not use them or allow their values; each with a clause that says so.
+class Parsed(NamedTuple):
+    """What a config and overrides say, by dotted key."""
 
-    `source` and `overrides` must be ones that `load_config` accepts.
-    """
-    values, wanted = _given(source, overrides)
-    method = algorithms[{**values, **wanted}["search.algorithm"]]
-    return foreign_keys(values, wanted, method.settings, algorithms)
-
-
-def idle_keys(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
-    """Keys of the overrides that the method of a config, or the chosen kind of a part, does not have; each with the
-    name of that method or kind. Nothing if `load_config` cannot read the config or does not know its method."""
-    try:
-        values, wanted = _given(source, overrides)
-        method = str({**values, **wanted}.get("search.algorithm"))
-        settings = algorithms[method].settings
-    except (KeyError, ConfigError):
-        return {}
-    chosen = filled_in({**values, **wanted}, settings) | values | wanted
-    idle = {key: method for key in wanted if not has_effect(key, settings)}
-    for key in wanted:
-        kind = f"{key.rpartition('.')[0]}.{KIND}"
-        if key not in idle and kinds_without(key, chosen.get(kind), settings):
-            idle[key] = f"{kind} = {show(chosen[kind])}"
-    return idle
+    name: str
+    file: Mapping[str, Any]
+    wanted: Mapping[str, Any]
+    """Values of overrides."""
+    unusable: Collection[str]
+    """Names of sections that are no mappings."""
+    problems: Sequence[Problem]
 
 
-def kept(
-    source: Source, overrides: Overrides, *, tasks: Mapping[str, TaskSpec], algorithms: Methods
-) -> dict[str, KeptValue]:
-    """Keys of a config whose values replace other defaults of the algorithm, or of the kind of a part, that the
-    overrides choose in the place of its own.
-
-    Nothing of a config whose algorithm is unknown. Raises ConfigError if `source` cannot be read.
-    """
-    values, wanted = _given(source, overrides)
-    task, method = (str({**values, **wanted}.get(key)) for key in ("task.environment", "search.algorithm"))
-    by_task: dict[str, Any] = {}
-    with contextlib.suppress(KeyError, ConfigError):
-        by_task = values_of_task(_looked_up(tasks, task, values, wanted))
-    try:
-        return kept_values(values, wanted, algorithms[method].settings, algorithms, by_task)
-    except (KeyError, ConfigError):
-        return {}
-
-
-def _given(source: Source, overrides: Overrides) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Values by dotted key of a source, and of overrides."""
-    mapping = source if isinstance(source, Mapping) else read_config(source)
-    return sort_keys(mapping)[0], parse_overrides(overrides)[0]
-
-
-def _looked_up(known: Mapping[str, Any], name: str, values: Mapping[str, Any], wanted: Mapping[str, Any]) -> Any:
-    """The task, with what a config chooses for it, or the method of a name."""
-    return known.chosen(name, **settings_of_task(values, wanted)) if isinstance(known, Tasks) else known[name]
-
-
-def changed_config(
-    source: Source,
-    overrides: Overrides = (),
-    *,
-    tasks: Mapping[str, TaskSpec],
-    algorithms: Methods,
-    rollouts: Rollouts,
-    name: str = "config",
-) -> RunConfig:
-    """The config of an existing run with some keys changed.
-
-    Values that are derived from the changed keys, by a preset or from the task, are resolved again. The caller checks
-    whether the run may change in this way. Arguments are as for `load_config`; `source` is a resolved config, such as
-    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more.
-
-    Raises:
-        ConfigError: as for `load_config`.
-    """
-    return _load(source, overrides, tasks, algorithms, rollouts, {}, name, new=False, resolved=True)
-
-
-def _load(
-    source: Source,
-    overrides: Overrides,
-    tasks: Mapping[str, TaskSpec],
-    algorithms: Methods,
-    rollouts: Rollouts,
-    defaults: Mapping[str, Any],
-    name: str,
-    *,
-    new: bool,
-    resolved: bool,
-) -> RunConfig:
+def parse(source: Source, overrides: Overrides, name: str) -> Parsed:
+    """What a config and overrides say, by dotted key."""
+    mapping: Mapping[Any, Any]
     if isinstance(source, Mapping):
         mapping = source
     else:
         name = os.fspath(source)
         mapping = read_config(name)
-    values, unusable, problems = sort_keys(mapping)
+    file, unusable, problems = by_key(mapping)
     wanted, more = parse_overrides(overrides)
-    problems += more
-    chosen = {**defaults, **values, **wanted}
-    selected: dict[str, Any] = {}
-    unknown: list[Problem] = []
-    for key, what, known, besides in (
-        (
-            "task.environment",
-            "task",
-            tasks,
-            "brax:NAME, mujoco:ID, gymnasium:ID, python:module:Class, function:module:name, or module:Class",
-        ),
-        ("search.algorithm", "algorithm", algorithms, "module:function"),
+    return Parsed(name, file, wanted, unusable, [*problems, *more])
+
+
+def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> Reading:
+    """Read what a config says."""
+    name, file, wanted, unusable, problems = parsed
+    defaults = {} if searches else {"search.algorithm": next(iter(known.algorithms)), "budget.generations": 1}
+    chosen = {**defaults, **file, **wanted}
+    task, settings, unknown = _chosen(chosen, parsed, known)
+    left_out = _left_out(file, wanted, Values(chosen, task, settings, known.rollouts), settings, known.algorithms)
+    file = {key: value for key, value in file.items() if key not in left_out}
+    given = {**defaults, **file, **wanted}
+    drafted = Values(given, task, settings, known.rollouts)
+    kept = _kept(parsed, drafted, settings, known.algorithms)
+    wrong = key_problems(given, wanted, drafted, settings, known.algorithms)
+    idle = {key: value for key, value in given.items() if _is_idle(key, task, settings)}
+    used = {key: value for key, value in given.items() if key not in {*wrong, *idle} and not asks(key, value)}
+    bad = _value_problems(used, drafted, settings, known.algorithms)
+    options, wrong_options = ({}, []) if task is None else read_options(used, task)
+    used = {key: value for key, value in used.items() if not key.startswith(TASK_OPTIONS)} | options
+    invalid = {*bad, *wrong} | {key for key in FIELDS if key.split(".")[0] in unusable}
+    values = Values(used, task, settings, known.rollouts, invalid)
+    problems = [
+        *problems,
+        *wrong.values(),
+        *bad.values(),
+        *unknown,
+        *wrong_options,
+        *_idle_problems(idle, values, known.algorithms, task),
+        *problems_of(values, (*RULES, *START_RULES) if new else RULES),
+    ]
+    return Reading(name, file | dict(wanted), wanted, left_out, kept, values, problems, task, settings)
+
+
+def _chosen(
+    chosen: Mapping[str, Any], parsed: Parsed, known: Known
+) -> tuple[TaskSpec | None, type[SearchConfig] | None, list[Problem]]:
+    """The task and the settings of the method that a config names, None where it names none, and the problems."""
+
+    def task_of_name(name: str) -> TaskSpec:
+        tasks = known.tasks
+        return tasks.chosen(name, **settings_of_task(*parsed[1:3])) if isinstance(tasks, Tasks) else tasks[name]
+
+    found: list[Any] = []
+    problems: list[Problem] = []
+    others = "brax:NAME, mujoco:ID, gymnasium:ID, python:module:Class, function:module:name, or module:Class"
+    for key, what, names, look_up, besides in (
+        ("task.environment", "task", known.tasks, task_of_name, others),
+        ("search.algorithm", "algorithm", known.algorithms, known.algorithms.__getitem__, "module:function"),
     ):
-        given, allowed = chosen.get(key), f"{one_of(known)}, or {besides}"
-        if key not in chosen and key.split(".")[0] not in unusable:
-            unknown.append(problem_of(key, None, f"missing; must be {allowed}", allowed=allowed))
+        given, allowed = chosen.get(key), f"{one_of(names)}, or {besides}"
+        found.append(None)
+        if key not in chosen and key.split(".")[0] not in parsed.unusable:
+            problems.append(problem_of(key, None, f"missing; must be {allowed}", allowed=allowed))
         try:
-            named = isinstance(given, str) and given != ""
-            selected[key] = _looked_up(known, str(given), values, wanted) if named else None
+            if isinstance(given, str) and given != "":
+                found[-1] = look_up(given)
         except KeyError:
-            meant = meant_task(str(given), known) if what == "task" else nearest(given, known)
+            meant = meant_task(str(given), names) if what == "task" else nearest(given, names)
             hint = f"; did you mean {meant}?" if meant else ""
-            sentence = f"{key}: {show(given)} is not a known {what}; must be {allowed}{hint}"
-            unknown.append(Problem(sentence, key, given, allowed, meant))
+            sentence = f"{show(given)} is not a known {what}; must be {allowed}{hint}"
+            problems.append(problem_of(key, given, sentence, suggestion=meant, allowed=allowed))
         except ConfigError as error:
             where = error.field or key
             sentence = str(error) if error.field else f"{key}: {error}"
-            unknown.append(Problem(sentence, where, chosen.get(where)))
-    task: TaskSpec | None = selected.get("task.environment")
-    method = selected.get("search.algorithm")
-    settings: type[SearchConfig] | None = None if method is None else method.settings
-
-    foreign = foreign_keys(values, wanted, settings, algorithms)
-    if resolved:
-        values = without_derived(values, wanted, algorithms)
-    values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}} | wanted
-    by_task = {} if task is None else values_of_task(task)
-    filled = {} if settings is None or "search" in unusable else by_task | filled_in(by_task | values, settings)
-    wrong = key_problems(filled | values, wanted, settings, algorithms)
-    problems += wrong.values()
-    unused = settings.unused if settings is not None else ()
-    idle = {key: value for key, value in values.items() if key in unused or (task and is_idle(key, task))}
-    left_open = {key for key, ask in LEFT_OPEN.items() if key in idle or _asks(values.get(key, ask), ask)}
-    values = {key: value for key, value in values.items() if key not in {*wrong, *idle, *left_open}}
-    values = {key: value for key, value in filled.items() if key not in left_open} | values
-    bad = _value_problems(values, settings, algorithms)
-    problems += [*bad.values(), *unknown]
-    values = {key: value for key, value in values.items() if key not in bad}
-    if task is not None:
-        read, more = read_options(values, task)
-        values = {key: value for key, value in values.items() if not key.startswith(TASK_OPTIONS)} | read
-        problems += more
-    values = resolve(values, left_open, task, settings, rollouts)
-    if task is not None:
-        problems += task_problems(values, task) + policy_problems(values, task)
-        problems += map_problems(values, task)
-        problems += objective_problems(values, with_options(task, options_of(values)))
-    if settings is not None:
-        problems += _idle_problems(idle, values, algorithms, task) + method_problems(values, settings)
-        problems += start_problems(values, settings) if new else []
-    problems += rollout_problems(values, task, rollouts) + shape_problems(values) + engine_problems(values, rollouts)
-    problems += folder_problems(values) + hidden_problems(values, task, rollouts) if new else []
-    if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
-        problems.append(problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
-    if problems or settings is None:
-        count = counted(len(problems), "problem")
-        raise ConfigError.listing(f"{name}: {count}", problems)
-    nested = _nested(values)
-    return RunConfig.model_validate(nested | {"search": settings.model_validate(nested["search"])}).made_for(task)
+            problems.append(Problem(sentence, where, chosen.get(where)))
+    task, method = found
+    return task, None if method is None else method.settings, problems
 
 
-def _asks(value: object, ask: str | None) -> bool:
-    """Whether a value asks for its key to be resolved. A plain `==` would fail for an array in a Python mapping."""
-    return value is None if ask is None else isinstance(value, str) and value == ask
+def _left_out(
+    file: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    chosen: Values,
+    settings: type[SearchConfig] | None,
+    algorithms: Methods,
+) -> dict[str, str]:
+    """See `Made.left_out`."""
+    left_out: dict[str, str] = {}
+
+    def is_replaced(key: str) -> bool:
+        return key in wanted and wanted[key] != file.get(key)
+
+    if is_replaced("task.environment"):
+        why = f"{wanted['task.environment']} replaces its task"
+        left_out |= {key: why for key in file if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
+    if settings is None:
+        return {key: why for key, why in left_out.items() if key not in wanted}
+    if other := is_replaced("search.algorithm"):
+        known = file if ":" in str(file.get("search.algorithm")) else all_search_fields(algorithms)
+        forbidden = {problem.field for problem in problems_of(chosen, METHOD_RULES)}
+        forbidden |= {CLIP} if NORMALISED in forbidden else set()  # the bound is in standard deviations
+        gone = {key for key in (*known, *settings.unused) if not has_effect(key, settings)} | forbidden
+        left_out |= {key: replaces("search.algorithm", wanted["search.algorithm"]) for key in file if key in gone}
+    for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
+        if other or is_replaced(kind):
+            why, its = replaces(kind, chosen[kind]), [key for key in file if kind_of(key) == kind]
+            left_out |= {key: why for key in its if lacks(key, chosen[kind], settings)}
+    return {key: why for key, why in left_out.items() if key not in wanted}
+
+
+def _kept(parsed: Parsed, chosen: Values, settings: type[SearchConfig] | None, algorithms: Methods) -> dict[str, Kept]:
+    """See `Made.kept`."""
+    kept: dict[str, Kept] = {}
+    before = chosen.of(parsed.file)
+    choices = [key for key in parsed.wanted if key == "search.algorithm" or key.endswith(f".{KIND}")]
+    replaced = {key for key in choices if parsed.wanted[key] != before.get(key)}
+    if settings is None or not replaced:
+        return kept
+    rows = (row for of in (settings, *(method.settings for method in algorithms.values())) for row in preset_rows(of))
+    declared = {*search_fields(settings), *(row.key for row in rows)} - _CHOSEN
+    for key, value in chosen.given.items():
+        by = next((name for name in ("search.algorithm", kind_of(key)) if name in replaced), None)
+        if by is None or key in parsed.wanted or key not in declared or not has_effect(key, settings):
+            continue
+        with contextlib.suppress(Unknown):
+            default = chosen.of({name: given for name, given in chosen.given.items() if name != key})[key]
+            if not asks(key, value) and as_tuple(value) != default:
+                kept[key] = Kept(value, default, by, show(parsed.wanted[by]))
+    return kept
+
+
+def _is_idle(key: str, task: TaskSpec | None, settings: type[SearchConfig] | None) -> bool:
+    """Whether a key has no effect with a method, or with a task that has no policy."""
+    of_policy = key.startswith("policy.") or key in ("task.episode_steps", "task.descriptor")
+    return (settings is not None and key in settings.unused) or (
+        task is not None and task.parameters is not None and of_policy
+    )
 
 
 def _idle_problems(
-    idle: Mapping[str, Any], values: Mapping[str, Any], algorithms: Methods, task: TaskSpec | None
+    idle: Mapping[str, Any], values: Values, algorithms: Methods, task: TaskSpec | None
 ) -> list[Problem]:
     """Problems of values of keys without effect. A value that the key has anyway is none, so that a resolved config can
     be loaded like any other.
 
     Args:
-        idle: keys without effect with the algorithm or the task, and the values given for them.
-        values: resolved values, without those of `idle`.
+        idle: keys without effect with the method or the task, and the values given for them.
+        values: those of the config without these.
     """
-    known = {key: field.default for key, field in FIELDS.items() if not field.is_required()} | dict(values)
-    return [
-        problem_of(key, value, f"{show(value)} has no effect with {task.name}, which has no policy; leave it out")
-        if task is not None and is_idle(key, task)
-        else no_effect(key, value, values["search.algorithm"], algorithms, known[key])
-        for key, value in idle.items()
-        if key in known and not (key in LEFT_OPEN and _asks(value, LEFT_OPEN[key]))
-        if not (isinstance(value, int | float | str | list | tuple | None) and as_tuple(value) == known[key])
-    ]
-
-
-def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings from dotted keys, the inverse of `flat`; every section is present, even if empty."""
-    nested: dict[str, Any] = {section: {} for section in SECTIONS}
-    for name, value in values.items():
-        *path, leaf = name.split(".")
-        target = nested
-        for group in path:
-            target = target.setdefault(group, {})
-        target[leaf] = value
-    return nested
+    problems = []
+    for key, value in idle.items():
+        is_plain = isinstance(value, int | float | str | list | tuple | None)
+        if asks(key, value) or key not in values or (is_plain and as_tuple(value) == values[key]):
+            continue
+        if task is not None and _is_idle(key, task, None):
+            what = f"{show(value)} has no effect with {task.name}, which has no policy; leave it out"
+            problems.append(problem_of(key, value, what))
+        else:
+            problems.append(no_effect(key, value, values["search.algorithm"], algorithms, values[key]))
+    return problems
 
 
 def _value_problems(
-    values: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
+    values: Mapping[str, Any], drafted: Values, settings: type[SearchConfig] | None, algorithms: Methods
 ) -> dict[str, Problem]:
     """Key -> problem for each value that is invalid by itself. Missing keys are not reported here, nor are options.
 
     Args:
+        drafted: all values, of which the kinds of parts are needed.
         settings: those of the method; None if it is not known: then those of the method that has most of the keys.
     """
     if settings is None:
         known = [method.settings for method in algorithms.values()]
         settings = max(known, key=lambda candidate: len(values.keys() & search_fields(candidate)))
     fields, parts = FIELDS | all_search_fields(algorithms) | search_fields(settings), parts_of(settings)
-    kinds = {key: fields[key].default for part in parts if (key := f"{part}.kind")}
-    nested = _nested({key: value for key, value in (kinds | dict(values)).items() if not key.startswith(TASK_OPTIONS)})
+    kinds = {key: drafted.get(key, fields[key].default) for part in parts if (key := f"{part}.{KIND}")}
+    plain = {key: value for key, value in {**kinds, **values}.items() if not key.startswith(TASK_OPTIONS)}
+    sections = nested(plain)
     wrong_keys: set[str] = set()
     problems: dict[str, Problem] = {}
-    for model, section, mapping in ((RunConfig, (), nested), (settings, ("search",), nested.pop("search"))):
+    for model, section, mapping in ((RunConfig, (), sections), (settings, ("search",), sections.pop("search"))):
         try:
             model.model_validate(mapping)
         except ValidationError as error:
             for item in error.errors(include_url=False):
                 place = [str(component) for component in (*section, *item["loc"])]
                 if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
-                    place[2:3] = [] if len(place) > 2 else ["kind"]
+                    place[2:3] = [] if len(place) > 2 else [KIND]
                 if not item["loc"]:  # a rule that the class of a user's search has
                     problems["search"] = problem_of("search", None, item["msg"])
                 # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
@@ -348,7 +354,7 @@ def _bad_value(name: str, value: object, field: FieldInfo) -> Problem:
 
 _PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 _LIMITS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
-"""Types and limits that the settings of a user's search may have without the words of `config/fields.py`."""
+"""Types and limits that the settings of a user's search may have without the words of `config/parts.py`."""
 
 
 def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:

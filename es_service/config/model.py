@@ -7,13 +7,12 @@ A `RunConfig` contains no `auto` that would affect results. Create it with `load
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, SerializeAsAny
 
-from es_service.config.caller import CALLER
-from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
-from es_service.config.fields import (
+from es_service.config.parts import (
     TASK_OPTIONS,
     BoundPairs,
     CellCounts,
@@ -22,6 +21,7 @@ from es_service.config.fields import (
     NotNegative,
     Number,
     Options,
+    Patience,
     Positive,
     Section,
     Seed,
@@ -29,12 +29,11 @@ from es_service.config.fields import (
     Text,
     Widths,
 )
-from es_service.config.search import PopulationConfig, SearchConfig
-from es_service.config.yaml_text import dump_yaml
-from es_service.errors import ConfigError
-from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
+from es_service.config.search import SearchConfig
+from es_service.config.text import dump_yaml
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.policy_spec import Activation, Output
-from es_service.protocol.sources import task_code, worker_sources
+from es_service.protocol.sources import task_code
 
 
 class TaskConfig(Section):
@@ -190,6 +189,175 @@ class StoreConfig(Section):
     )
 
 
+class WorkerResources(Section):
+    """Resources of one worker."""
+
+    cpu: Literal["auto"] | Count = Field(
+        "auto",
+        description="Cores of each Ray actor, all of which it uses. auto: those of a node if the nodes are equal, so "
+        "that a node needs few messages, else 1; with a GPU 1. It never changes results.",
+    )
+    gpu: NotNegative = Field(
+        0.0,
+        description="GPUs of each worker. With a fraction below 1, workers share a GPU; with 0, episodes run on the "
+        "CPU. With rollout xla, a GPU has bits of its own.",
+    )
+
+
+class ComputeConfig(Section):
+    """How the work is divided and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
+
+    engine: Literal["ray", "inline"] = Field(
+        description="How the workers run. inline: as child processes of this program. ray: as Ray actors, on this "
+        "machine or in a cluster. auto: ray if an address is given or actors have several cores, else inline, which "
+        "starts sooner and sends messages faster."
+    )
+    inline_workers: Literal["processes", "threads"] = Field(
+        "processes",
+        description="With engine inline: whether each worker is a process, or all workers are threads of one process. "
+        "Threads need rollout simd and take less memory, but if one worker crashes, all are lost.",
+    )
+    address: Text | None = Field(
+        None,
+        description="With engine ray: address of the cluster to connect to, HOST:PORT, or auto for the cluster on this "
+        "machine; null starts a Ray instance for this run.",
+    )
+    workers: Literal["auto"] | Count = Field(
+        "auto",
+        description="Number of workers, each of which is a core, or with GPUs its share of them. auto: every core of "
+        "the machine or cluster that has work, or with the engine inline and GPUs as many as these have room for; with "
+        "a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is work for, in "
+        "whole actors. It never changes results.",
+    )
+    platform: Literal["any", "x86_64", "aarch64"] = Field(
+        "any",
+        description="Architecture of the processors that work for the run; a worker on another one is refused. any: "
+        "all. What computed the run is recorded, and its digest is marked mixed once there are several kinds.",
+    )
+    max_workers_per_core: Count = Field(
+        4,
+        description="Most workers for each core where all workers are on this machine; a larger number of workers is "
+        "refused. Raise it only for a task whose steps wait for something outside, such as another program.",
+    )
+    worker_resources: WorkerResources = Field(
+        default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),
+        description="Resources of one worker, which Ray reserves for its actor if the engine is ray.",
+    )
+    rollout: Text = Field(
+        description="How episodes are computed. simd: by code compiled for this kind of processor or GPU, about twenty "
+        "times faster. xla: by JAX, for tasks that simd cannot compile. host: by the Python code of a task "
+        "that is not in JAX. auto: the fastest that can."
+    )
+    chunk_pairs: Count = Field(
+        description="Pairs in one chunk; must divide search.pairs. auto: the largest divisor of search.pairs up to an "
+        "eighth of it (this limit is at least 16 and at most 64), and a multiple of 8 if there is one."
+    )
+    rollout_block_pairs: Count = Field(
+        description="With rollout xla: pairs whose episodes step together, so that their weights stay in the cache; "
+        "must divide chunk_pairs. auto: the largest divisor of chunk_pairs up to 32 whose weights take at most 5 MiB."
+    )
+    gradient_block_pairs: Count = Field(
+        description="Pairs summed into one partial gradient; at most search.pairs. auto: the smallest number of whole "
+        "chunks that gives at most 32 blocks and makes each block large enough to be worth a message."
+    )
+    chunk_timeout_s: Positive = Field(
+        30.0,
+        description="Shortest deadline of a chunk in seconds; slow chunks make the deadline of later chunks longer, "
+        "and each attempt may take twice as long as the one before. It counts anew whenever a worker reports progress.",
+    )
+    first_chunk_timeout_s: Positive = Field(
+        120.0,
+        description="Deadline in seconds of a chunk while it is not known how long chunks of its kind take, which is "
+        "until the first one is done; at least chunk_timeout_s. Compilation does not count.",
+    )
+    compile_timeout_s: Positive = Field(
+        120.0,
+        description="Deadline in seconds for the compilation that a worker does before its first chunk of each kind; "
+        "for a task of Python objects, longest time in which one of them must be made or reset.",
+    )
+    max_attempts: Count = Field(4, description="Attempts to compute a chunk before the run stops with its error.")
+    place_timeout_s: Positive | None = Field(
+        None,
+        description="With engine ray in a cluster: longest time in seconds for which the run waits for a first place, "
+        "before it stops; null: as long as it takes.",
+    )
+    no_worker_timeout_s: Patience = Field(
+        120.0,
+        description="Seconds without a live worker, after the first had come up, after which the run stops. A worker "
+        "that has not started after half of this time is replaced; on a busy machine a start takes up to ten seconds.",
+    )
+    parent_cache_mb: Count = Field(
+        256,
+        description="Most MiB of elites' parameters that each worker keeps, of which it makes the policies of "
+        "map_elites; what it does not keep is sent again. It never changes results.",
+    )
+    worker_output_bytes: Count = Field(
+        2**20,
+        description="About how many bytes are kept of what each worker prints, its simulators included: the newest. "
+        "The last lines are told if the worker is lost.",
+    )
+    dispatch_log: Switch = Field(
+        False,
+        description="Whether the run folder gets a dispatch.jsonl: what was sent to each worker, what it answered, and "
+        "why it was lost.",
+    )
+
+
+COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
+"""Keys of `compute` that affect floating-point results and are therefore constants of the run."""
+ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
+    "inline": {"compute.address": None, "compute.worker_resources.cpu": "auto"},
+    "ray": {"compute.inline_workers": "processes"},
+}
+"""Engine -> settings that only the other engine uses, with the values that they must have with this one."""
+
+
+def implied_by(engine: str | None, address: str | None) -> dict[str, Any]:
+    """Settings that a choice of the engine or of a cluster's address implies; None: no choice."""
+    if address is None:
+        return ENGINE_IMPLIES.get(engine or "", {})
+    return ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})  # only a Ray cluster can be joined
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A value that a config gives to a key, although what it was written for has been replaced."""
+
+    value: Any
+    default: Any
+    """What the key would have without it."""
+    replaced: str
+    """The key that overrides have changed: `search.algorithm`, or the kind of a part."""
+    by: str
+    """The value of that key now."""
+
+    @property
+    def why(self) -> str:
+        """What is replaced, as a clause."""
+        return replaces(self.replaced, self.by)
+
+
+def replaces(key: str, value: Any) -> str:
+    """A clause that says which value replaces that of a config file."""
+    return f"{value} replaces its {'algorithm' if key == 'search.algorithm' else key}"
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a config was made from."""
+
+    task: TaskSpec
+    """The task from which values that were left open were resolved."""
+    given: Mapping[str, Any] = field(compare=False)
+    """What was given, by dotted key."""
+    left_out: Mapping[str, str] = field(compare=False)
+    """Keys of the file that go with the task, the method or the kind of a part that overrides have replaced, or whose
+    values the new method does not allow; each with a clause that says so."""
+    kept: Mapping[str, Kept] = field(compare=False)
+    """Keys of the file that keep their values although overrides replace the method, or the kind of a part, for which
+    they were written, and the new one has another default."""
+
+
 class RunConfig(Section):
     """The config of a whole run. Equal configs give equal results, wherever and however often they run."""
 
@@ -202,18 +370,20 @@ class RunConfig(Section):
     compute: ComputeConfig
     store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
-    _task: TaskSpec | None = PrivateAttr(None)
+    _made: Made | None = PrivateAttr(None)
 
-    def made_for(self, task: TaskSpec | None) -> RunConfig:
-        """The same config, which knows the task from which its values were resolved."""
+    def made_of(self, made: Made) -> RunConfig:
+        """The same config, which knows what it was made from."""
         config = self.model_copy()
-        config._task = task
+        config._made = made
         return config
 
     @property
-    def resolved_with(self) -> TaskSpec | None:
-        """The task from which values that were left open were resolved; None if it is not known."""
-        return self._task
+    def made(self) -> Made:
+        """What the config was made from."""
+        if self._made is None:
+            raise ValueError("this config was not loaded; load it with load_config")
+        return self._made
 
     def resolved_yaml(self) -> str:
         """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""
@@ -221,10 +391,13 @@ class RunConfig(Section):
 
     def constants(self) -> dict[str, Any]:
         """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""
-        sections = self.model_dump(mode="json")
-        del sections["budget"], sections["store"]
-        sections["compute"] = {key: sections["compute"][key] for key in COMPUTE_CONSTANTS}
-        return flat(sections)
+        return {key: value for key, value in flat(self.model_dump(mode="json")).items() if is_constant(key)}
+
+
+def is_constant(key: str) -> bool:
+    """Whether resume must not change the value of a key."""
+    section, _, name = key.partition(".")
+    return section not in ("budget", "store") and (section != "compute" or name in COMPUTE_CONSTANTS)
 
 
 def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -235,61 +408,3 @@ def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         is_group = isinstance(value, Mapping) and prefix != TASK_OPTIONS
         values |= flat(value, f"{prefix}{key}.") if is_group else {f"{prefix}{key}": value}
     return values
-
-
-def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
-    """The policy of a run, from the task's observation to its action."""
-    policy, widths = config.policy, (task.observation_size, *config.policy.hidden, task.action_size)
-    return PolicySpec(widths, policy.activation, policy.output, policy.bias, policy.memory or 0)
-
-
-def require_episodes(task: TaskSpec, *, asks_caller: bool) -> None:
-    """Raise ConfigError if a task has no episodes of its own, and the caller is not asked for them."""
-    if task.kind == CALLER and not asks_caller:
-        raise ConfigError(
-            "the episodes of this run are those of the program that asks it, so the service can compute none; to "
-            "continue it, that program calls es_service.ask_tell with the same config and folder",
-            field="task.environment",
-            value=CALLER,
-        )
-
-
-def worker_spec(
-    config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = (), *, asks_caller: bool = False
-) -> WorkerSpec:
-    """The message that every worker of the run receives once, when it starts.
-
-    Args:
-        outputs: see `WorkerSpec.outputs`; those that the search reads are added.
-        asks_caller: whether the caller computes the episodes of a task that has none of its own.
-
-    Raises ConfigError as `require_episodes`.
-    """
-    require_episodes(task, asks_caller=asks_caller)
-    settings, policy, compute, search = config.task, config.policy, config.compute, config.search
-    return WorkerSpec(
-        seed=config.seed,
-        environment=settings.environment,
-        environment_options=dict(settings.options),
-        descriptor=settings.descriptor,
-        allow_infeasible=search.allow_infeasible,
-        time_limit_s=settings.time_limit_s,
-        descriptor_size=0 if settings.descriptor is None else len(task.descriptor_names),
-        policy=policy_spec(config, task),
-        episode_steps=settings.episode_steps,
-        fitness=settings.fitness,
-        episodes_per_member=settings.episodes_per_member,
-        observation_clip=policy.observation_clip,
-        action_noise=policy.action_noise,
-        common_random_numbers=not isinstance(search, PopulationConfig) or search.common_random_numbers,
-        chunk_pairs=compute.chunk_pairs,
-        rollout_block_pairs=compute.rollout_block_pairs,
-        gradient_block_pairs=compute.gradient_block_pairs,
-        rollout=compute.rollout,
-        noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
-        outputs=tuple(sorted({*outputs, *search.outputs()})),
-        parent_cache_bytes=compute.parent_cache_mb * 2**20,
-        output_bytes=compute.worker_output_bytes,
-        sources=worker_sources(*settings.code),
-        platform=compute.platform,
-    )

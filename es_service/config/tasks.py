@@ -14,19 +14,62 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from es_service.config.caller import CALLER, caller_task
 from es_service.config.model import RunConfig
-from es_service.config.yaml_text import show
-from es_service.errors import ConfigError
-from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
-from es_service.protocol.options import Option, OptionValue, choice, option_values
-from es_service.protocol.parameters import ParameterSpec
+from es_service.config.parts import TASK_OPTIONS
+from es_service.config.resolution import options_of
+from es_service.config.text import in_line, nearest, one_of, problem_of, show, wrong_value
+from es_service.errors import ConfigError, Problem
+from es_service.protocol.messages import UNBOUNDED, DescriptorChoice, TaskSpec, with_options
+from es_service.protocol.options import (
+    Option,
+    OptionValue,
+    allowed_text,
+    allowed_value,
+    choice,
+    defaults_of,
+    is_plain,
+    option_values,
+)
+from es_service.protocol.parameters import FREE, ParameterSpec
 from es_service.protocol.parent import answer_of
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import task_code, user_sources
 from workers import environments
 from workers.rollouts import BACKENDS
+
+CALLER = "caller"
+"""Name of the task, and its kind."""
+OPTIONS = {
+    "observation_size": Option(0, low=0, high=1_000_000),
+    "action_size": Option(0, low=0, high=1_000_000),
+    "parameters": Option(0, low=0, high=10_000_000),
+    "descriptor_size": Option(2, low=1, high=1000),
+    "episode_steps": Option(1, low=1),
+}
+"""Either the sizes of a policy, or the number of parameters of something else; and the dimensions of the descriptor."""
+
+
+def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
+    """Description of the task with these options; those that are left out or not allowed have their defaults."""
+    values = option_values(OPTIONS, options)
+    observations, actions, parameters, dimensions, steps = (int(str(value)) for value in values.values())
+    names = tuple(f"p{index}" for index in range(parameters))
+    return TaskSpec(
+        name=CALLER,
+        observation_size=1 if parameters else max(1, observations),
+        action_size=parameters or max(1, actions),
+        episode_steps=max(1, steps),
+        descriptor_names=tuple(f"d{index}" for index in range(max(1, dimensions))),
+        descriptor_bounds=(UNBOUNDED,) * max(1, dimensions),
+        final_fitness=False,
+        has_goal=False,
+        options=dict(OPTIONS),
+        summary="episodes that the program computes which asks the search",
+        kind=CALLER,
+        parameters=ParameterSpec(names, (FREE,) * parameters, (0.0,) * parameters) if parameters else None,
+    )
+
 
 DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
@@ -77,22 +120,22 @@ ROLLOUTS: Rollouts = BACKENDS
 
 
 def task_of(config: RunConfig) -> TaskSpec:
-    """The task of a run, with the descriptor that its options choose.
+    """The task of a run, with the descriptor that its options choose, as it was when the config was loaded."""
+    return with_options(config.made.task, config.task.options)
 
-    Raises ConfigError if the task has changed since its values were filled into the config, such as its episode length:
-    the run would have some values of the old task and some of the new one.
-    """
-    settings, before = config.task, config.resolved_with
+
+def require_same_task(config: RunConfig) -> None:
+    """Raise ConfigError if the task has changed since its values were filled into the config, such as its episode
+    length: the run would have some values of the old task and some of the new one."""
+    settings, before = config.task, config.made.task
     task = TASKS.chosen(settings.environment, settings.options, settings.descriptor)
-    changes = [] if before is None else _changes(before, task)
-    if changes:
+    if changes := _changes(before, task):
         raise ConfigError(
             f"the task {task.name} has changed since this config was loaded ({', '.join(changes)}); load the config "
             "again",
             field="task.environment",
             value=task.name,
         )
-    return with_options(task, config.task.options)
 
 
 def _changes(before: TaskSpec, now: TaskSpec) -> list[str]:
@@ -156,3 +199,48 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
             },
         }
     )
+
+
+def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """What a config chooses for its task besides its name, as arguments of `Tasks.chosen`.
+
+    Values of types that no task takes are left out; they are reported elsewhere.
+
+    Args:
+        values: those of the file.
+        wanted: those of overrides. If they choose another task, what the file says of its own is left out.
+    """
+    name = "task.environment"
+    chosen = dict(wanted) if name in wanted and wanted[name] != values.get(name) else {**values, **wanted}
+    descriptor = chosen.get("task.descriptor")
+    if isinstance(descriptor, list):
+        descriptor = tuple(descriptor)
+    is_chosen = descriptor and (isinstance(descriptor, str) or all(type(index) is int for index in descriptor))
+    options = {key: value for key, value in options_of(chosen).items() if is_plain(value)}
+    return {"options": options, "descriptor": descriptor if is_chosen else None}
+
+
+def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:
+    """Value of every option that a task declares by its key, and the problems of the given values."""
+    declared = task.options
+    options = {f"{TASK_OPTIONS}{name}": default for name, default in defaults_of(declared).items()}
+    problems = []
+    for name, value in options_of(values).items():
+        key = f"{TASK_OPTIONS}{name}"
+        if name not in declared:
+            known = f"{task.name} has {one_of(declared) if declared else 'none'}"
+            meant = nearest(name, declared)
+            hint = f"; did you mean {meant}?" if meant else ""
+            problems.append(problem_of(key, value, f"unknown option; {known}{hint}", suggestion=meant))
+        elif (read := _read(declared[name], value)) is None:
+            problems.append(wrong_value(key, value, allowed_text(declared[name], show), declared[name].choices))
+        else:
+            options[key] = read
+    return options, problems
+
+
+def _read(option: Option, value: Any) -> OptionValue | None:
+    """A value of a config as a value of the option; None if it is not allowed."""
+    if isinstance(option.default, str) and option.choices and type(value) in (bool, int, float):
+        value = in_line(value)  # YAML reads a choice such as 10 as a number
+    return allowed_value(option, value)

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from es_service.config.compute import ENGINE_IMPLIES
+from es_service.config.model import ENGINE_IMPLIES
 from es_service.dispatch.ray_head import require_head
 from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, read_membership
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept

@@ -17,7 +17,7 @@ from collections.abc import Callable, Hashable, Sequence
 from types import ModuleType
 from typing import Any
 
-from es_service.config.parallel import ANY_NUMBER
+from es_service.config.workload import ANY_NUMBER
 from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message

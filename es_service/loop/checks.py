@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.problems import one_of
 from es_service.config.search import PopulationConfig, SearchConfig
+from es_service.config.text import one_of
 from es_service.errors import EvaluationError, WayOut
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import Centre, EpisodesResult

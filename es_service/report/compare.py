@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.fields import RESOURCES
-from es_service.config.problems import did_you_mean, nearest
+from es_service.config.parts import RESOURCES
 from es_service.config.resolution import LEFT_OPEN
-from es_service.config.yaml_text import in_line
+from es_service.config.text import did_you_mean, in_line, nearest
 from es_service.errors import ConfigError
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from es_service.config.fields import TASK_OPTIONS
-from es_service.config.loading import load_config
-from es_service.config.methods import search_fields
+from es_service.config.keys import KIND, search_fields
+from es_service.config.loading import Known, read
 from es_service.config.model import flat
-from es_service.config.options import options_of
-from es_service.config.resolution import LEFT_OPEN
+from es_service.config.parts import TASK_OPTIONS
+from es_service.config.resolution import LEFT_OPEN, options_of
 from es_service.config.search import SearchConfig
 from es_service.config.tasks import ROLLOUTS
-from es_service.config.yaml_text import in_line
-from es_service.errors import ConfigError
+from es_service.config.text import in_line
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
 from es_service.protocol.options import defaults_of
 from es_service.search.algorithms import OURS
@@ -73,18 +71,15 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
         method.settings
     ).keys()
     following = {key: values[key] for key in values if key not in LEFT_OPEN and key not in unknown}
-    try:
-        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: method}, "rollouts": ROLLOUTS}
-        plain, followed = (
-            flat(load_config(source, overrides, **known, new=False).model_dump(mode="json"))
-            for source, overrides in ((least, {}), (least, following))
-        )
-    except ConfigError:
+    known = Known({environment: task}, {algorithm: method}, ROLLOUTS)
+    plain, followed = (read(least, overrides, known, new=False) for overrides in ({}, following))
+    if plain.problems or followed.problems:
         return {}
+    kinds = {key: value for key, value in values.items() if key.endswith(f".{KIND}")}  # a key of a part is one of its
+    of_parts = plain.values.of({**plain.values.given, **kinds}).known()
+    changed = {key: plain.values[key] for key in kinds if key in plain.values}
     first = {TASK_OPTIONS + name: default for name, default in defaults_of(task.options).items()}
-    fields = search_fields(method.settings)  # a key of a part's kind that is not the default has a default of its own
-    kinds = {key: fields[key].default for key in values.keys() & fields.keys() if not fields[key].is_required()}
-    return kinds | plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
+    return of_parts | changed | {key: followed.values[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
 
 
 def _plain(value: Any) -> Any:

@@ -21,10 +21,10 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from es_service.config.keys import Overrides
-from es_service.config.loading import Source
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.given import Overrides, Source
+from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info

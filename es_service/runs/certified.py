@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import create_model
 
-from es_service.config.yaml_text import show
+from es_service.config.text import show
 from es_service.errors import StoreError
 from es_service.loop.forms import BOOL, INTEGER, REAL, Sizes, array_problem
 from es_service.protocol.messages import FloatArray

@@ -8,16 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from es_service.config import loading
+from es_service.config import changes
 from es_service.config.changes import changed_constants
-from es_service.config.fields import TASK_OPTIONS
-from es_service.config.keys import Overrides
-from es_service.config.loading import Source
-from es_service.config.methods import search_fields
+from es_service.config.given import Overrides, Source
+from es_service.config.keys import search_fields
+from es_service.config.loading import Known, read
 from es_service.config.model import RunConfig
+from es_service.config.parts import TASK_OPTIONS
 from es_service.config.tasks import ROLLOUTS, TASKS, task_of
 from es_service.protocol.options import defaults_of
 from es_service.search.algorithms import ALGORITHMS
+
+KNOWN = Known(TASKS, ALGORITHMS, ROLLOUTS)
+"""All tasks, searches and rollouts that a config may name."""
 
 
 def load_config(
@@ -33,32 +36,18 @@ def load_config(
     Raises:
         ConfigError: lists every problem found.
     """
-    return accepted(
-        loading.load_config(
-            source,
-            overrides,
-            tasks=TASKS,
-            algorithms=ALGORITHMS,
-            rollouts=ROLLOUTS,
-            new=new,
-            searches=searches,
-            name=name,
-        )
-    )
+    return accepted(read(source, overrides, KNOWN, new=new, searches=searches, name=name).config())
 
 
-def changed_config(source: Source, overrides: Overrides = (), *, name: str = "config") -> RunConfig:
-    """The config of a run that exists, with some keys changed; see `loading.changed_config`.
-
-    Args:
-        name: what an error calls a `source` that is no file.
+def changed_config(
+    source: Source, overrides: Overrides = (), *, given: Mapping[str, Any] | None = None, name: str = "config"
+) -> RunConfig:
+    """The config of a run that exists, with some keys changed; see `changes.changed_config`.
 
     Raises:
         ConfigError: lists every problem found.
     """
-    return accepted(
-        loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS, name=name)
-    )
+    return accepted(changes.changed_config(source, overrides, KNOWN, given=given, name=name))
 
 
 def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[str, Any, Any]]:

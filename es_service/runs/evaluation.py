@@ -15,8 +15,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch.dispatch_log import no_log
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut

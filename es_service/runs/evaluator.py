@@ -17,11 +17,10 @@ from typing import Any, Literal, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.config.compute import implied_by
-from es_service.config.loading import Source
-from es_service.config.model import RunConfig, policy_spec
-from es_service.config.parallel import ANY_NUMBER
-from es_service.config.tasks import task_of
+from es_service.config.given import Source
+from es_service.config.model import RunConfig, implied_by
+from es_service.config.tasks import require_same_task, task_of
+from es_service.config.workload import ANY_NUMBER, policy_spec
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, EvaluationError
 from es_service.logs import logger
@@ -300,7 +299,7 @@ def _started(
 ) -> PolicyEvaluator:
     """See `evaluator`."""
     config = evaluating_config(config, workers, engine, address)
-    task = task_of(config)  # before the workers start, since it may raise
+    task = task_of(config)
     outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
     start = partial(
         make_engine, config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs
@@ -315,11 +314,9 @@ def evaluating_config(
     given = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
     overrides = implied_by(engine, address) | {key: value for key, value in given.items() if value is not None}
     if not isinstance(config, RunConfig):
-        config = load_config(config, overrides, new=False, searches=False)
-    elif overrides:
-        task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
-        config = changed_config(config.model_dump(mode="json"), overrides)
-    return config
+        return load_config(config, overrides, new=False, searches=False)
+    require_same_task(config)
+    return changed_config(config.model_dump(mode="json"), overrides, given=config.made.given) if overrides else config
 
 
 def _tell_wait(shortage: str) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from es_service.config.problems import unknown_name
+from es_service.config.text import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.protocol.parameters import ParameterSpec
 from es_service.runs.snapshot import Snapshot, map_places

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from es_service.config.given import config_file
 from es_service.config.model import RunConfig
-from es_service.config.shipped import config_file
 from es_service.errors import ConfigError
 from es_service.protocol.machine import PACKAGES
 from es_service.protocol.sources import modules_of, user_path

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from es_service.config.changes import START_KEYS, does_not_fit, start_afresh
-from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.model import RunConfig, policy_spec
+from es_service.config.given import Overrides, parse_overrides
+from es_service.config.model import RunConfig
 from es_service.config.parts import TargetObjective
+from es_service.config.rules import start_of
 from es_service.config.search import CandidatesConfig
-from es_service.config.start import start_of
 from es_service.config.tasks import task_of
-from es_service.config.yaml_text import show
+from es_service.config.text import show
+from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, Problem
 from es_service.loop.parts import (
     BEST,
@@ -81,7 +82,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
         )
     present = origin.present_config
     mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
-    config = changed_config(mapping, overrides, name=str(origin.config_file))
+    given = None if (given := origin.meta.given) is None else {**given, "search.init_from": None}
+    config = changed_config(mapping, overrides, given=given, name=str(origin.config_file))
     changes = changes_from(origin.constants, config)
     problems = [
         _problem_of(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new, ALGORITHMS)

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.compute import COMPUTE_CONSTANTS
-from es_service.config.fields import TASK_OPTIONS
-from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.model import RunConfig
-from es_service.config.options import settings_of_task
-from es_service.config.tasks import TASKS, task_of
-from es_service.config.yaml_text import show
+from es_service.config.given import Overrides, parse_overrides
+from es_service.config.model import COMPUTE_CONSTANTS, RunConfig
+from es_service.config.parts import TASK_OPTIONS
+from es_service.config.tasks import TASKS, settings_of_task, task_of
+from es_service.config.text import show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import EpisodesResult, TaskSpec, with_options
 from es_service.protocol.options import OptionValue, allowed_value, option_values

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 
-from es_service.config.keys import Overrides, parse_overrides
+from es_service.config.given import Overrides, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.config.parts import TargetObjective
 from es_service.config.search import CandidatesConfig

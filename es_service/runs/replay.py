@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.compute import ENGINE_IMPLIES
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.model import ENGINE_IMPLIES, RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info

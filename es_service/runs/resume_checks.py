@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from es_service.config.caller import CALLER
 from es_service.config.changes import refused_changes
 from es_service.config.model import RunConfig
-from es_service.config.tasks import task_of
-from es_service.config.yaml_text import show
+from es_service.config.tasks import CALLER, task_of
+from es_service.config.text import show
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import Column, evaluated_columns, history_columns

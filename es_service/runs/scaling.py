@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.model import RunConfig, worker_spec
-from es_service.config.parallel import chunks_of_phases
+from es_service.config.model import RunConfig
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import chunks_of_phases, worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.ray_engine import ray_engine
@@ -313,6 +313,7 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
         run_id=f"{0:032x}",
         created="2025-01-01T00:00:00+00:00",
         config=config.model_dump(mode="json"),
+        given=dict(config.made.given),
         constants=config.constants(),
         task=asdict(task),
         columns=history,

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from es_service.config.map_rules import placing_seconds
-from es_service.config.model import MapConfig, RunConfig, policy_spec, worker_spec
-from es_service.config.parallel import parallel_sentence
+from es_service.config.model import MapConfig, RunConfig
+from es_service.config.rules import placing_seconds
 from es_service.config.tasks import task_of
+from es_service.config.workload import parallel_sentence, policy_spec, worker_spec
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits

@@ -13,8 +13,9 @@ from typing import Any
 from uuid import uuid4
 
 from es_service.config.changes import again_with
-from es_service.config.model import RunConfig, require_episodes
-from es_service.config.tasks import task_of
+from es_service.config.model import RunConfig
+from es_service.config.tasks import require_same_task, task_of
+from es_service.config.workload import require_episodes
 from es_service.dispatch import dispatch_log
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
@@ -63,6 +64,7 @@ def create_run(
     """
     require_no_import_of_a_task()
     require_cores(config, again)
+    require_same_task(config)
     is_new, task = not folder.exists(), task_of(accepted(config))
     require_episodes(task, asks_caller=listener.asks_caller)
     history, evaluations = columns(config, task)
@@ -70,6 +72,7 @@ def create_run(
         run_id=uuid4().hex,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         config=config.model_dump(mode="json"),
+        given=dict(config.made.given),
         constants=config.constants(),
         task=asdict(task),
         columns=history,
@@ -153,6 +156,7 @@ def _session(
             listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
+        require_same_task(config)
         require_episodes(task_of(config), asks_caller=listener.asks_caller)
         require_resumable(store, config, asked, strict=strict)
         try:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from es_service.config.keys import policy_of
+from es_service.config.resolution import policy_of
 from es_service.errors import StoreError
 from es_service.loop.forms import INTEGER, REAL, Sizes, missing, problem
 from es_service.loop.parts import Parts

@@ -17,8 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Literal
 
-from es_service.config.keys import Overrides
-from es_service.config.loading import Source
+from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
 from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from es_service.config.model import RunConfig
-from es_service.config.parallel import chunks_at_once
+from es_service.config.workload import chunks_at_once
 from es_service.dispatch.cores import cores
 from es_service.dispatch.ray_cluster import nodes_of_cluster
 from es_service.dispatch.ray_nodes import actor_cores, with_work

@@ -10,17 +10,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from es_service.config.changes import KeptValue
-from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.loading import Source, idle_keys, kept
-from es_service.config.model import RunConfig
-from es_service.config.problems import one_of
-from es_service.config.tasks import TASKS
-from es_service.config.yaml_text import in_line, plain, show
+from es_service.config.given import Overrides, Source, parse_overrides
+from es_service.config.loading import read
+from es_service.config.model import Kept, RunConfig
+from es_service.config.text import in_line, one_of, plain, show
 from es_service.errors import ConfigError, Problem, StoreError, counted
-from es_service.runs.checked_config import changes_from, load_config
+from es_service.runs.checked_config import KNOWN, accepted, changes_from
 from es_service.runs.view import open_run
-from es_service.search.algorithms import ALGORITHMS
 from es_service.store.folder import holds_run
 
 SEED = "seed"
@@ -91,7 +87,7 @@ def plan(
     if problems:
         raise _refused(source, problems)
     combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
-    idle = [idle_keys(source, {**common, **settings}, ALGORITHMS) for settings in combinations]
+    idle = [read(source, {**common, **settings}, KNOWN, new=False).idle for settings in combinations]
     used = {
         key
         for settings, without in zip(combinations, idle, strict=True)
@@ -109,16 +105,16 @@ def plan(
         raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
     planned: list[PlannedRun] = []
     wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
-    stays: dict[str, list[KeptValue]] = {}
+    stays: dict[str, list[Kept]] = {}
     for name, (settings, gone) in named.items():
         wanted = {key: value for key, value in common.items() if key not in gone} | settings
         folder = out / name
+        reading = read(source, wanted, KNOWN, new=here and not holds_run(folder))
+        for key, value in reading.kept.items():
+            if len(grid.get(value.replaced, ())) > 1:
+                stays.setdefault(key, []).append(value)
         try:
-            for key, value in kept(source, wanted, tasks=TASKS, algorithms=ALGORITHMS).items():
-                if len(grid.get(value.replaced, ())) > 1:
-                    stays.setdefault(key, []).append(value)
-            new = here and not holds_run(folder)
-            planned.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new), gone))
+            planned.append(PlannedRun(name, folder, wanted, accepted(reading.config()), gone))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
@@ -153,7 +149,7 @@ def _axis_problems(axes: Mapping[str, Sequence[Any]], has_seed: bool, common: Ma
     return problems
 
 
-def _kept_problem(key: str, kept: Sequence[KeptValue]) -> Problem:
+def _kept_problem(key: str, kept: Sequence[Kept]) -> Problem:
     """The problem of a value of the config that other methods, or kinds of a part, would have in the place of their
     own defaults."""
     value, methods = kept[0].value, {}

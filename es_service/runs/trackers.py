@@ -17,7 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from es_service.config.problems import unknown_name
+from es_service.config.text import unknown_name
 from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import Row
 from es_service.runs.view import Run

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop import driver

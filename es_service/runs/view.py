@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from es_service.config.compute import COMPUTE_CONSTANTS
-from es_service.config.yaml_text import read_yaml_file
+from es_service.config.model import COMPUTE_CONSTANTS
+from es_service.config.text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, Parts, elite_part
 from es_service.protocol.messages import PolicySpec

@@ -6,12 +6,11 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from es_service.config.caller import CALLER
 from es_service.config.changes import again_with
-from es_service.config.compute import ENGINE_IMPLIES, implied_by
-from es_service.config.fields import RESOURCES
-from es_service.config.model import RunConfig
-from es_service.config.parallel import chunks_at_once
+from es_service.config.model import ENGINE_IMPLIES, RunConfig, implied_by
+from es_service.config.parts import RESOURCES
+from es_service.config.tasks import CALLER
+from es_service.config.workload import chunks_at_once
 from es_service.dispatch.cores import cores
 from es_service.dispatch.gpus import places
 from es_service.errors import ConfigError, WayOut, counted

@@ -25,8 +25,8 @@ from pydantic import (
     model_validator,
 )
 
-from es_service.config.compute import COMPUTE_CONSTANTS
-from es_service.config.keys import policy_of
+from es_service.config.model import COMPUTE_CONSTANTS
+from es_service.config.resolution import policy_of
 from es_service.loop.history import Column
 from es_service.protocol.messages import TaskSpec
 
@@ -137,6 +137,7 @@ class RunFacts(BaseModel):
     columns: list[Column]
     evaluation_columns: list[Column]
     parent: Parent | None = None
+    given: dict[str, Any] | None = None
 
     @model_validator(mode="after")
     def _fits_together(self) -> RunFacts:

@@ -69,6 +69,9 @@ class RunMeta:
     parent: dict[str, Any] | None = None
     """Run from which this one was forked or took its first centre: run id, folder, generation, digest. None if there is
     none."""
+    given: dict[str, Any] | None = None
+    """What `config` was resolved from: the values that the user gave, by dotted key. A fork resolves again what it
+    changes of it. None for a run of an older version: all values of `config`."""
 
     @cached_property
     def heading(self) -> bytes:

@@ -21,8 +21,9 @@ import pandas as pd
 from scipy.stats import ks_2samp
 
 from es_service import api
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.machine import cpu_kind
 from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk, WorkerSpec
 

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service import api
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from tests.benchmarks.simd_physics import peak

@@ -17,8 +17,8 @@ from unittest.mock import patch
 import numpy as np
 
 from es_service import api
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.messages import Centre, Chunk, EvaluationChunk, TrainingChunk
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import ISAS, host_target

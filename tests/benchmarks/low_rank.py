@@ -16,8 +16,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.messages import Centre, Chunk, GradientChunk, TrainingChunk
 from es_service.runs.checked_config import load_config
 from workers.policies.policy import initial_parameters

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from es_service import api
-from es_service.config.model import policy_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import policy_spec
 from es_service.loop import driver
 from es_service.loop.history import history_columns
 from es_service.loop.parts import Arrays, cell_part, elite_part, elite_to_arrays

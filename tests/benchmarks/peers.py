@@ -28,8 +28,8 @@ import pandas as pd
 
 from es_service import api
 from es_service.cli.bench_rollouts import bench_rollouts
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine

@@ -27,8 +27,8 @@ from unittest.mock import patch
 import numpy as np
 
 from es_service import api
-from es_service.config.model import policy_spec, worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts

@@ -38,8 +38,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service import api
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work

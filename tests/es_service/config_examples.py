@@ -6,7 +6,8 @@ import string
 
 from hypothesis import strategies as st
 
-from es_service.config.loading import load_config
+from es_service.config import changes
+from es_service.config.loading import Known, read
 from es_service.config.model import RunConfig
 from es_service.search.algorithms import ALGORITHMS
 from workers import environments
@@ -19,5 +20,22 @@ MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget
 WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
 
 
+def load_config(source, overrides=(), *, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS, **how) -> RunConfig:
+    return read(source, overrides, Known(tasks, algorithms, rollouts), **how).config()
+
+
+def left_out(source, overrides, **known) -> dict[str, str]:
+    """Keys of a config that overrides make useless, each with the reason."""
+    return dict(
+        read(
+            source, overrides, Known(**({"tasks": TASKS, "algorithms": ALGORITHMS, "rollouts": BACKENDS} | known))
+        ).left_out
+    )
+
+
+def changed_config(source, overrides=(), *, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS, **how) -> RunConfig:
+    return changes.changed_config(source, overrides, Known(tasks, algorithms, rollouts), **how)
+
+
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
+    return load_config(source, overrides)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from es_service.config.compute import COMPUTE_CONSTANTS
+from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.loop.history import NO_INTEGER, Column
 from es_service.store import upkeep as store_upkeep
 from es_service.store.connection import reading

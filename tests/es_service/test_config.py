@@ -11,21 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from es_service.config.changes import changed_constants
-from es_service.config.keys import FIELDS
-from es_service.config.loading import changed_config, load_config
-from es_service.config.methods import all_search_fields
-from es_service.config.model import worker_spec
-from es_service.config.presets import PRESETS, preset_table, preset_values
-from es_service.config.resolution import (
-    config_warnings,
-    default_chunk_pairs,
-    default_gradient_block_pairs,
-    default_rollout_block_pairs,
-)
-from es_service.config.yaml_text import dump_yaml, parse_value
+from es_service.config.keys import FIELDS, all_search_fields
+from es_service.config.resolution import default_chunk_pairs, default_gradient_block_pairs, default_rollout_block_pairs
+from es_service.config.search import PRESETS, preset_table, preset_values
+from es_service.config.text import dump_yaml, parse_value
+from es_service.config.workload import config_warnings, worker_spec
 from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS, OURS
-from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
+from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, changed_config, load, load_config
 from workers.rollouts import BACKENDS
 from workers.rollouts.simd import Simd
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from es_service.config.changes import changed_constants, refused_changes
-from es_service.config.loading import changed_config, left_out, load_config
 from es_service.config.model import RunConfig
-from es_service.config.yaml_text import parse_value
+from es_service.config.text import parse_value
 from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS
-from tests.es_service.config_examples import MINIMAL, TASKS, load
+from tests.es_service.config_examples import MINIMAL, TASKS, changed_config, left_out, load, load_config
 from workers.environments import SHIPPED
 from workers.rollouts import BACKENDS
 
@@ -73,20 +72,21 @@ def test_another_task_has_its_own_default_options():
     other = {"tasks": SHIPPED, "algorithms": ALGORITHMS, "rollouts": BACKENDS}
     loaded = load_config(source, ["task.environment=ant_maze"], **other)
     assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {})
-    assert left_out(source, ["task.environment=ant_maze"], ALGORITHMS) == {
+    assert left_out(source, ["task.environment=ant_maze"], **other) == {
         "task.options.start": "ant_maze replaces its task"
     }
     for same in ([], ["task.environment=point_maze"]):
         assert load_config(source, same, **other).task.options == {"start": "corner"}
-        assert left_out(source, same, ALGORITHMS) == {}
+        assert left_out(source, same, **other) == {}
     with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has none"):
         load_config(source, ["task.environment=ant_maze", "task.options.start=corner"], **other)
 
 
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:
-    stored = parse_value((config or load()).resolved_yaml())
+    config = config or load()
+    stored = parse_value(config.resolved_yaml())
     assert isinstance(stored, dict)
-    return changed_config(stored, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
+    return changed_config(stored, overrides, given=config.made.given)
 
 
 def changes(*overrides: str, config: RunConfig | None = None) -> list[str]:
@@ -124,6 +124,35 @@ def test_what_follows_from_a_changed_key_is_resolved_anew():
     shaped = load(MINIMAL, "search.pairs=16", "compute.chunk_pairs=4", "map.qd_offset=3")
     assert changes("search.pairs=16", "task.fitness=sum", config=shaped) == []
     assert changes("task.fitness=final", "map.qd_offset=3", config=shaped) == ["task.fitness: sum -> final"]
+
+
+def test_what_the_user_gave_remains_where_a_default_would_change():
+    shaped = load(MINIMAL, "search.pairs=16", "compute.chunk_pairs=4", "map.qd_offset=3")
+    assert changes("task.fitness=final", config=shaped) == ["task.fitness: sum -> final"]
+    assert changes("search.pairs=32", config=shaped) == [
+        "search.pairs: 16 -> 32",
+        "compute.gradient_block_pairs: 16 -> 32",
+    ]
+    assert changed("search.pairs=32", config=shaped).made.given == shaped.made.given | {"search.pairs": 32}
+
+
+def test_what_a_change_leaves_as_it_was_has_the_defaults_of_the_version_that_began_the_run():
+    """The stored config is that of a version with other defaults: 256 pairs, chunks of 32, 7 evaluation episodes."""
+    older = load(MINIMAL, "search.pairs=256", "search.evaluation_episodes=7", "search.sigma=0.5")
+    assert older.compute.chunk_pairs == 32
+    stored, given = parse_value(older.resolved_yaml()), load().made.given
+    assert "search.pairs" not in given
+    assert changed_config(stored, given=given) == older
+    for override, differs in (
+        ("policy.action_noise=0.1", {"policy.action_noise"}),
+        ("compute.chunk_pairs=auto", set()),
+        ("compute.chunk_pairs=16", {"compute.chunk_pairs", "compute.rollout_block_pairs"}),
+        ("compute.worker_resources.gpu=1", set()),
+        ("search.pairs=128", {"search.pairs", "compute.chunk_pairs", "compute.rollout_block_pairs"}),
+    ):
+        new = changed_config(stored, [override], given=given).constants()
+        found = {key for key, _, _ in changed_constants(older.constants(), new)}
+        assert found - {"compute.gradient_block_pairs"} == differs, override
 
 
 def test_every_problem_of_a_change_is_told():

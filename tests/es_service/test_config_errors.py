@@ -10,15 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
-from es_service.config.resolution import MOST_DESCRIPTOR_DIMENSIONS
+from es_service.config.rules import MOST_DESCRIPTOR_DIMENSIONS
 from es_service.errors import ConfigError
 from es_service.loop.history import history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms import OURS
 from es_service.store.schema import table_statements
-from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
+from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load_config
 from tests.es_service.store_examples import without_root_rights
 from workers.rollouts import BACKENDS
 

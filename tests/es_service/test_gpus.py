@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from es_service import load_config
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch import gpus
 from es_service.dispatch.events import Limits
 from es_service.dispatch.gpus import places

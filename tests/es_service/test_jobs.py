@@ -19,8 +19,8 @@ from es_service.cli import jobs as cli_jobs
 from es_service.cli import sweep
 from es_service.cli.commands import error_message
 from es_service.cli.main import app
-from es_service.config.keys import parse_overrides
-from es_service.config.yaml_text import dump_yaml
+from es_service.config.given import parse_overrides
+from es_service.config.text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.sources import driver_sources, worker_sources
 from es_service.runs import jobs

@@ -12,21 +12,22 @@ import pytest
 
 from es_service import api
 from es_service.cli.options import print_config_notes
-from es_service.config.loading import kept, left_out
-from es_service.config.methods import all_search_fields, has_effect, methods_with, no_effect
+from es_service.config.given import shipped_configs
+from es_service.config.keys import all_search_fields, has_effect, methods_with, no_effect
+from es_service.config.loading import Known, read
 from es_service.config.model import flat
-from es_service.config.shipped import shipped_configs
 from es_service.config.tasks import TASKS
-from es_service.config.yaml_text import dump_yaml, parse_value, read_yaml_file
+from es_service.config.text import dump_yaml, parse_value, read_yaml_file
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.parameters import FREE, ParameterSpec
 from es_service.runs.lineage import fork_config
 from es_service.runs.sweep_plan import plan
 from es_service.search.algorithms import ALGORITHMS, OURS
-from tests.es_service.config_examples import MINIMAL, load
+from tests.es_service.config_examples import MINIMAL, left_out, load
 from tests.es_service.test_shipped_configs import ALL
 from workers.environments import SHIPPED
+from workers.rollouts import BACKENDS
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -126,7 +127,7 @@ def test_another_kind_leaves_out_the_keys_of_the_one_it_replaces():
         ("search.algorithm=es", "ranks replaces its search.shaping.kind"),
     ):
         assert load(source, wanted).search.shaping.kind == why.split()[0]
-        assert left_out(source, [wanted], OURS) == {"search.shaping.count": why}
+        assert left_out(source, [wanted]) == {"search.shaping.count": why}
     assert problems(source, "search.shaping.kind=signs", "search.shaping.count=5") == [
         "search.shaping.count: 5 has no effect with search.shaping.kind = signs; leave it out (a key of kind top_pairs)"
     ]
@@ -145,10 +146,10 @@ def test_another_algorithm_leaves_out_the_keys_of_the_one_it_replaces():
     source = MINIMAL | {"search": {"algorithm": "me_es", "emitters": 4, "sigma": 0.3, "block_generations": 5}}
     config = load(source, "search.algorithm=es")
     assert config.search.model_dump().items() >= {"sigma": 0.3, "centres": 1}.items()
-    assert list(left_out(source, ["search.algorithm=es"], OURS)) == ["search.emitters", "search.block_generations"]
+    assert list(left_out(source, ["search.algorithm=es"])) == ["search.emitters", "search.block_generations"]
     why = "memes replaces its algorithm"
-    assert left_out(source, ["search.algorithm=memes"], OURS) == {"search.block_generations": why}
-    assert left_out(source, ["search.algorithm=me_es", "search.sigma=1"], OURS) == {}
+    assert left_out(source, ["search.algorithm=memes"]) == {"search.block_generations": why}
+    assert left_out(source, ["search.algorithm=me_es", "search.sigma=1"]) == {}
     assert problems(source, "search.algorithm=es", "search.emitters=3") == [
         f"search.emitters: 3 has no effect with es; leave it out (a key of {having('search.emitters')})"
     ]
@@ -166,12 +167,12 @@ def test_values_of_a_file_that_the_chosen_method_does_not_allow_are_left_out():
     source = MINIMAL | observing | {"search": {"algorithm": "ns_es", "centres": 4}}
     why = "map_elites replaces its algorithm"
     forbidden = ["policy.observation_normalization", "policy.observation_clip", "map.enabled"]
-    assert left_out(source, ["search.algorithm=map_elites"], OURS) == dict.fromkeys(forbidden, why)
+    assert left_out(source, ["search.algorithm=map_elites"]) == dict.fromkeys(forbidden, why)
     config = load(source, "search.algorithm=map_elites")
     assert not config.policy.observation_normalization
     assert (config.policy.observation_clip, config.map.enabled, config.search.centres) == (None, True, 4)
-    assert list(left_out(source, ["search.algorithm=es"], OURS)) == ["search.centres"]
-    assert left_out(source | {"search": {"algorithm": "ns_es", "centres": "auto"}}, ["search.algorithm=es"], OURS) == {}
+    assert list(left_out(source, ["search.algorithm=es"])) == ["search.centres"]
+    assert left_out(source | {"search": {"algorithm": "ns_es", "centres": "auto"}}, ["search.algorithm=es"]) == {}
     assert problems(source, "search.algorithm=map_elites", "policy.observation_normalization=true", "map.enabled=false")
     assert len(problems(source | {"search": {"algorithm": "map_elites"}})) == 2  # the file itself says both
 
@@ -180,7 +181,7 @@ def test_keys_that_are_left_out_are_named_on_the_command_line(tmp_path, capsys):
     file, wanted = tmp_path / "my.yaml", ["search.algorithm=es", "task.environment=ant_maze"]
     task = {"environment": "point_maze", "options": {"start": "corner"}}
     file.write_text(dump_yaml(MAP_ELITES | {"task": task, "search": {"algorithm": "map_elites", "batch": 16}}))
-    print_config_notes(file, [(wanted, api.load_config(file, wanted))])
+    print_config_notes(file, [api.load_config(file, wanted)])
     printed = " ".join("".join(capsys.readouterr()).split())
     assert f"note: ignored task.options.start of {file}, since ant_maze replaces its task" in printed
     assert f"note: ignored search.batch of {file}, since es replaces its algorithm" in printed
@@ -189,7 +190,8 @@ def test_keys_that_are_left_out_are_named_on_the_command_line(tmp_path, capsys):
 def found(source, *wanted, tasks: Mapping[str, TaskSpec] = TASKS):
     """What stays: key -> (value, default of what has been chosen)."""
     return {
-        key: (one.value, one.default) for key, one in kept(source, wanted, tasks=tasks, algorithms=ALGORITHMS).items()
+        key: (one.value, one.default)
+        for key, one in read(source, wanted, Known(tasks, ALGORITHMS, BACKENDS)).kept.items()
     }
 
 
@@ -242,7 +244,7 @@ def test_values_that_replace_other_defaults_of_a_chosen_kind_are_found():
 def test_values_that_stay_are_named_on_the_command_line(tmp_path, capsys):
     file, wanted = tmp_path / "my.yaml", ["search.algorithm=map_elites"]
     file.write_text(dump_yaml(MINIMAL | {"search": {"algorithm": "es", "evaluation_episodes": 30}}))
-    print_config_notes(file, [(wanted, api.load_config(file, wanted))])
+    print_config_notes(file, [api.load_config(file, wanted)])
     printed = " ".join("".join(capsys.readouterr()).split())
     kept_one = f"note: kept search.evaluation_episodes = 30 (by default 1) of {file}, although map_elites replaces its"
     assert f"{kept_one} algorithm" in printed
@@ -309,6 +311,18 @@ def test_a_fork_to_another_method_gives_up_keys_without_effect_there(tmp_path):
     config = fork_config(tmp_path / "run", ["search.algorithm=ns_es"])
     assert config.search.algorithm == "ns_es"
     assert not [key for key in config.constants() if "fitness_weight" in key]
+
+
+def test_a_run_stores_what_was_given_and_a_fork_resolves_what_it_changes_of_that(tmp_path):
+    source = MAP_ELITES | {"search": {"algorithm": "es", "pairs": 16}, "map": {"qd_offset": 3}}
+    run = api.run(api.load_config(source, ["budget.generations=1"]), tmp_path / "run").run
+    given = flat(source) | {"budget.generations": 1}
+    assert run.meta.given == given
+    config = fork_config(tmp_path / "run", ["search.pairs=128", "task.fitness=final"])
+    assert (config.compute.chunk_pairs, config.map.qd_offset) == (16, 3.0)
+    assert run.config["compute"]["chunk_pairs"] == 16 == run.config["search"]["pairs"]
+    assert fork_config(tmp_path / "run", ["search.pairs=256"]).compute.chunk_pairs == 32
+    assert config.made.given == given | {"search.pairs": 128, "task.fitness": "final", "search.init_from": None}
 
 
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)

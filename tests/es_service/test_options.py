@@ -7,13 +7,12 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from es_service.config.loading import changed_config, load_config
 from es_service.config.tasks import task_from_fields
-from es_service.config.yaml_text import parse_value, show
+from es_service.config.text import parse_value, show
 from es_service.errors import ConfigError
 from es_service.protocol.options import Option, allowed_text, choice, declared_options
 from es_service.search.algorithms import ALGORITHMS
-from tests.es_service.config_examples import MINIMAL, POINT_MAZE
+from tests.es_service.config_examples import MINIMAL, POINT_MAZE, changed_config, load_config
 from workers.rollouts import BACKENDS
 
 OPTIONS = {

@@ -8,14 +8,12 @@ import sys
 import pytest
 
 from es_service import api
-from es_service.config.loading import left_out
-from es_service.config.yaml_text import parse_value
+from es_service.config.text import parse_value
 from es_service.errors import ConfigError
 from es_service.report.settings import changed_settings
 from es_service.runs.checked_config import changed_config, changes_from
 from es_service.runs.sweep_plan import plan
-from es_service.search.algorithms import ALGORITHMS
-from tests.es_service.config_examples import MINIMAL, POINT_MAZE
+from tests.es_service.config_examples import MINIMAL, POINT_MAZE, left_out
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
@@ -122,7 +120,7 @@ def test_another_search_leaves_out_the_keys_of_the_one_it_replaces(own):
     source = own | {"search": own["search"] | {"gap": 3.0, "sigma": 0.3}}
     config = api.load_config(source, ["search.algorithm=es"])
     assert (config.search.sigma, "gap" in config.search.model_dump()) == (0.3, False)
-    assert left_out(source, ["search.algorithm=es"], ALGORITHMS) == {"search.gap": "es replaces its algorithm"}
+    assert left_out(source, ["search.algorithm=es"]) == {"search.gap": "es replaces its algorithm"}
 
 
 def test_a_search_that_calls_one_of_ours_with_more_keys_is_told_to_declare_them(own, tmp_path):

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from es_service import api
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.machine import VERSION, computed_on, is_mixed, platform_info, platform_text
 from es_service.runs import session
 from es_service.store.digest import checked_parts

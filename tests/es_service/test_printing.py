@@ -21,7 +21,7 @@ from es_service.cli.tables import sweep
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import print_status, print_summary
-from es_service.config.yaml_text import show
+from es_service.config.text import show
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.options import choice
 from es_service.report import progress

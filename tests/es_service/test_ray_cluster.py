@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from test.support import catch_unraisable_exception
 
-from es_service.config.parallel import ANY_NUMBER
+from es_service.config.workload import ANY_NUMBER
 from es_service.dispatch import ray_cluster, ray_nodes, ray_side_effects
 from es_service.dispatch.events import Limits
 from es_service.errors import EvaluationError, Interrupted

@@ -9,9 +9,8 @@ import pytest
 from es_service import api
 from es_service.api import load_config
 from es_service.cli.commands import error_message
-from es_service.config.compute import ComputeConfig
-from es_service.config.model import TaskConfig
-from es_service.config.parallel import chunks_at_once, chunks_of_phases, parallel_sentence
+from es_service.config.model import ComputeConfig, TaskConfig
+from es_service.config.workload import chunks_at_once, chunks_of_phases, parallel_sentence
 from es_service.dispatch.events import (
     Compiled,
     Result,

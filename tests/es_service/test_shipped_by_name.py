@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from es_service import load_config
 from es_service.api import default_folder
 from es_service.cli.main import app
-from es_service.config.shipped import config_file, first_sentence, shipped_configs, shipped_text
+from es_service.config.given import config_file, first_sentence, shipped_configs, shipped_text
 from es_service.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from es_service.config.loading import load_config
-from es_service.config.model import worker_spec
-from es_service.config.presets import preset_table
-from es_service.config.resolution import config_warnings
+from es_service.config.search import preset_table
 from es_service.config.tasks import TASKS
+from es_service.config.workload import config_warnings, worker_spec
 from es_service.search.algorithms import ALGORITHMS
+from tests.es_service.config_examples import load_config
 from workers.rollouts import BACKENDS
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -16,7 +16,7 @@ from es_service.api import load_config
 from es_service.cli.main import app
 from es_service.cli.sweep import grid_of, seeds_of
 from es_service.cli.tables.sweep import live_table
-from es_service.config.yaml_text import split_values
+from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
 from es_service.runs import sweep_cores

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from es_service.cli.bench_rollouts import bench_rollouts
-from es_service.config.loading import load_config
-from es_service.config.resolution import config_warnings
 from es_service.config.tasks import TASKS, task_of
+from es_service.config.workload import config_warnings
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
@@ -18,6 +17,7 @@ from es_service.protocol.messages import TrainingChunk, with_subject
 from es_service.protocol.noise import uniforms
 from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
+from tests.es_service.config_examples import load_config
 from tests.examples.beam import beam
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment

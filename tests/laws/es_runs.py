@@ -1,7 +1,7 @@
 """Small runs in memory, of ES unless another search is named."""
 
 from es_service.api import load_config
-from es_service.config.model import policy_spec, worker_spec
+from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import EpisodesResult, PolicySpec
 from es_service.search.algorithms import ALGORITHMS

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
+from es_service.config.workload import worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from es_service.config.model import policy_spec, worker_spec
 from es_service.config.parts import PlainStep, TopPairs
+from es_service.config.workload import policy_spec, worker_spec
 from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import pair_weights, shaped

@@ -56,7 +56,7 @@ def finished(tmp_path_factory, workers_here):
 
 def episodes_of(config, policy, episodes, number, ask, domain) -> EpisodesResult:
     """Episodes of one policy, computed apart from any engine."""
-    from es_service.config.model import worker_spec
+    from es_service.config.workload import worker_spec
 
     task = task_of(config)
     direct = DirectEvaluator(worker_spec(config, task, outputs_of(task)))

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from es_service import api
-from es_service.config.methods import has_effect
+from es_service.config.keys import has_effect
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec

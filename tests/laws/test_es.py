@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
+from es_service.config.workload import worker_spec
 from es_service.errors import EvaluationError
 from es_service.loop import driver
 from es_service.protocol.evaluator import DispatchCounts

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.api import load_config
-from es_service.config.parallel import chunks_at_once, parallel_sentence
+from es_service.config.workload import chunks_at_once, parallel_sentence
 from es_service.errors import ConfigError
 from es_service.loop.parts import elite_part
 from es_service.protocol.messages import PolicyChunk

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from es_service.api import load_config
-from es_service.config.parallel import parallel_sentence
+from es_service.config.workload import parallel_sentence
 from es_service.errors import ConfigError
 from es_service.loop.history import history_columns
 from es_service.loop.parts import elite_part

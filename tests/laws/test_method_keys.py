@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from es_service.config.loading import load_config
-from es_service.config.methods import has_effect as is_declared
-from es_service.config.model import policy_spec, worker_spec
+from es_service.config.keys import has_effect as is_declared
 from es_service.config.tasks import TASKS
+from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import history_columns
 from es_service.search import algorithms
 from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import arrays_sha256
+from tests.es_service.config_examples import load_config
 from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering
 from workers.environments import SHIPPED

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
 from es_service.config.parts import Ranks, Returns
+from es_service.config.workload import worker_spec
 from es_service.loop.checks import invalidate
 from es_service.loop.parts import state_from_parts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk

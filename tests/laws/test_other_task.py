@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 import es_service
 from es_service import api
 from es_service.cli.main import app
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, StoreError
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult

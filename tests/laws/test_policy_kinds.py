@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from es_service import api, evaluator
-from es_service.config.model import policy_spec
 from es_service.config.tasks import TASKS
+from es_service.config.workload import policy_spec
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import Certified
 from es_service.runs.export import export

@@ -43,7 +43,7 @@ def dangers(module: str, source: str) -> list[str]:
                 if name == "pickle" and isinstance(node, ast.ImportFrom):
                     found.append(f"{module}:{node.lineno} hides whose names these are: write `import pickle`")
                 if name.split(".")[0] == "yaml":
-                    found.append(f"{module}:{node.lineno} imports yaml: config/yaml_text.py reads YAML")
+                    found.append(f"{module}:{node.lineno} imports yaml: config/text.py reads YAML")
         elif isinstance(node, ast.Call):
             found += [f"{module}:{node.lineno} {danger}" for danger in _dangers_of_call(module, node)]
     return found
@@ -84,7 +84,7 @@ def test_data_do_not_become_code(path):
         ("es_service.store.codec", "np.load(file, allow_pickle=chosen)", "allows NumPy"),
         ("es_service.runs.view", "pd.read_pickle(file)", "calls pd.read_pickle"),
         ("es_service.config.loading", "import yaml", "imports yaml"),
-        ("es_service.config.yaml_text", "YAML(typ='unsafe')", "any object"),
+        ("es_service.config.text", "YAML(typ='unsafe')", "any object"),
         ("es_service.report.page", "eval(text)", "calls eval"),
         ("es_service.config.keys", "exec(text, {})", "calls exec"),
         ("es_service.runs.jobs", "subprocess.run(text, shell=True)", "starts a shell"),

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, Ranks, Returns, Signs, TopPairs
+from es_service.config.workload import worker_spec
 from es_service.loop.generation import estimate_gradients
 from es_service.protocol.evaluator import completed
 from es_service.protocol.messages import GradientResult

@@ -11,8 +11,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from es_service.cli.main import app
-from es_service.config.keys import FIELDS, GROUPS, RENAMED
-from es_service.config.methods import all_search_fields
+from es_service.config.keys import FIELDS, GROUPS, RENAMED, all_search_fields
 from es_service.loop.history import history_columns
 from es_service.search.algorithms import OURS
 from workers.environments import SHIPPED

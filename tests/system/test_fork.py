@@ -122,6 +122,12 @@ def test_a_state_that_does_not_fit_is_refused(parent, override, change):
     assert error_message(caught.value).endswith(f": es-service run CONFIG --set search.init_from={parent.folder}:best")
 
 
+def use_tasks(monkeypatch, known):
+    """Let configs find these tasks."""
+    monkeypatch.setattr(tasks, "TASKS", known)
+    monkeypatch.setattr(checked_config, "KNOWN", checked_config.KNOWN._replace(tasks=known))
+
+
 class Told(tasks.Tasks):
     """Tasks of which PointMaze is told to be another one."""
 
@@ -142,8 +148,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },
     )  # fmt: skip
-    for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", Told(told))
+    use_tasks(monkeypatch, Told(told))
 
     def work(*_, **__):  # as workers know of no such option
         yield from ()
@@ -157,8 +162,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     for other in ("speed", "height"):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from"):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
-    for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", Told(replace(told, descriptors={"place": (("a", "b"), bounds)})))
+    use_tasks(monkeypatch, Told(replace(told, descriptors={"place": (("a", "b"), bounds)})))
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from"):
         lineage.fork_config(tmp_path / "run")
 
@@ -166,8 +170,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
 def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkeypatch):
     """A user's own, edited: the same parameters would mean another network."""
     other = replace(SHIPPED["point_maze"], action_size=3)
-    for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", Told(other))
+    use_tasks(monkeypatch, Told(other))
     with pytest.raises(ConfigError, match=r"point_maze has changed since the run was created \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
     with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from"):
@@ -182,8 +185,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
     ],
 )
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
-    for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", Told(replace(SHIPPED["point_maze"], **change)))
+    use_tasks(monkeypatch, Told(replace(SHIPPED["point_maze"], **change)))
     with pytest.raises(ConfigError, match=rf"the task point_maze has changed since the run was created \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
 

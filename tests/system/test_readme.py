@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.config.keys import FIELDS
-from es_service.config.methods import all_search_fields, methods_with, search_fields
-from es_service.config.presets import preset_table
+from es_service.config.keys import FIELDS, all_search_fields, methods_with, search_fields
 from es_service.config.resolution import LEFT_OPEN
-from es_service.config.yaml_text import show
+from es_service.config.search import preset_table
+from es_service.config.text import show
 from es_service.search.algorithms import OURS
 from tests.system import warm
 

@@ -19,7 +19,7 @@ from es_service.cli.commands import error_message, way_command
 from es_service.cli.console import text_console
 from es_service.cli.tables.status import follow_status, print_summary
 from es_service.config.changes import again_with, refused_changes
-from es_service.config.compute import implied_by
+from es_service.config.model import implied_by
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.runs.evaluation import candidates
 from es_service.search.algorithms import ALGORITHMS

@@ -15,9 +15,8 @@ from rich.console import Console
 
 from es_service import api, load_config
 from es_service.cli.tables.status import print_status
-from es_service.config.model import policy_spec
-from es_service.config.parallel import chunks_of_phases
 from es_service.config.tasks import TASKS, task_of
+from es_service.config.workload import chunks_of_phases, policy_spec
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import evaluation_reset_keys

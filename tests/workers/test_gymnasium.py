@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from es_service import api, load_config
-from es_service.config.model import policy_spec
 from es_service.config.tasks import TASKS, task_of
-from es_service.config.yaml_text import parse_value
+from es_service.config.text import parse_value
+from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EvaluationChunk
 from es_service.protocol.noise import evaluation_reset_keys

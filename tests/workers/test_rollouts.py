@@ -7,7 +7,7 @@ import pytest
 
 from es_service import api, load_config
 from es_service.cli.bench_rollouts import bench_rollouts
-from es_service.config.resolution import config_warnings
+from es_service.config.workload import config_warnings
 from es_service.errors import ConfigError, EvaluationError
 from es_service.runs.replay import record
 from tests.workers.numpy_rollout import REGISTERING, NumPy

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-from es_service.config.presets import PRESETS, preset_table
-from es_service.config.shipped import first_sentence, shipped_configs
-from es_service.config.yaml_text import show
+from es_service.config.given import first_sentence, shipped_configs
+from es_service.config.search import PRESETS, preset_table
+from es_service.config.text import show
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
 from es_service.search.algorithms import ALGORITHMS

@@ -12,8 +12,7 @@ no l2.
 from __future__ import annotations
 
 from es_service.config.model import RunConfig
-from es_service.config.presets import same
-from es_service.config.search import PopulationConfig
+from es_service.config.search import PopulationConfig, same
 from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.common import novelty_search
 from es_service.search.algorithms.method import method

@@ -32,11 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import Count, CountAtOnce, Fraction, Positive
 from es_service.config.model import RunConfig
-from es_service.config.parts import FitnessObjective, NearnessObjective
-from es_service.config.presets import same
-from es_service.config.search import PopulationConfig
+from es_service.config.parts import Count, CountAtOnce, FitnessObjective, Fraction, NearnessObjective, Positive
+from es_service.config.search import PopulationConfig, same
 from es_service.errors import ConfigError, WayOut
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState, read_only

@@ -24,11 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import CountAtOnce, NotNegative
 from es_service.config.model import RunConfig
-from es_service.config.parts import Elites, MeasuredNewcomers, Once
-from es_service.config.presets import same
-from es_service.config.search import SearchConfig
+from es_service.config.parts import CountAtOnce, Elites, MeasuredNewcomers, NotNegative, Once
+from es_service.config.search import SearchConfig, same
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns

@@ -36,10 +36,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.parts import FitnessObjective, NoveltyObjective, Objective
-from es_service.config.presets import PresetRow
+from es_service.config.parts import Count, FitnessObjective, NoveltyObjective, Objective
+from es_service.config.search import PresetRow
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
 from es_service.search.algorithms.common import novelty_search, population

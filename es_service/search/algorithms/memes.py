@@ -23,10 +23,9 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.parts import FitnessObjective, NoveltyObjective, Objective
-from es_service.config.presets import same
+from es_service.config.parts import Count, FitnessObjective, NoveltyObjective, Objective
+from es_service.config.search import same
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
     NO_CELL,

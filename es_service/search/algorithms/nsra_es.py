@@ -15,9 +15,9 @@ from functools import partial
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, NotNegative
 from es_service.config.model import RunConfig
-from es_service.config.presets import PresetRow
+from es_service.config.parts import Count, Fraction, NotNegative
+from es_service.config.search import PresetRow
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.common import novelty_search
 from es_service.search.algorithms.method import method

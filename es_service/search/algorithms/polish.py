@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.presets import same
-from es_service.config.search import CandidatesConfig
+from es_service.config.parts import Count
+from es_service.config.search import CandidatesConfig, same
 from es_service.protocol.episodes import each
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState, read_only

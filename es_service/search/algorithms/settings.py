@@ -6,9 +6,8 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
-from es_service.config.fields import CountAtOnce
 from es_service.config.model import RunConfig
-from es_service.config.parts import ElitesOfCentres, Objectives, Once, outputs_of
+from es_service.config.parts import CountAtOnce, ElitesOfCentres, Objectives, Once, outputs_of
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import ConfigError
 

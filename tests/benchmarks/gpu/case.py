@@ -20,8 +20,8 @@ import numpy as np
 from jax import lax
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from tests.benchmarks.gpu.policies import WAYS, Way
