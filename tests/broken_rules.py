@@ -372,8 +372,8 @@ CASES = [
         (
             "is that of the results",
             ENGINE,
-            "(result for item_id, part in parts for result in separated(part, self._results.pop(item_id)))",
-            "(result for results in self._results.values() for result in results)",
+            "[result for item_id, _ in parts for result in self._results.pop(item_id)]",
+            "[result for results in self._results.values() for result in results]",
         ),
     ),
     *cases(

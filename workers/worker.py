@@ -6,13 +6,13 @@ A worker has no state that a restart would lose: every result is a pure function
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from es_service.protocol.episodes import addressed
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
@@ -116,9 +116,7 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
     def training_results(work: Sequence[tuple[Centre, TrainingChunk]], episodes: Episodes) -> list[ChunkResult]:
         shift_O = work[0][0].observation_mean_O
         parts = zip(work, _split(episodes, spec.chunk_pairs), strict=True)
-        return [
-            _with_failures(spec, subject_chunk, part, training_result(part, shift_O)) for subject_chunk, part in parts
-        ]
+        return [_told(spec, subject_chunk, part, training_result(part, shift_O)) for subject_chunk, part in parts]
 
     def evaluation_arguments(work: Sequence[tuple[Centre, EvaluationChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
@@ -134,9 +132,7 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
     def evaluation_results(work: Sequence[tuple[Centre, EvaluationChunk]], episodes: Episodes) -> list[ChunkResult]:
         parts = _split(episodes, EVALUATION_EPISODES_PER_CHUNK)
         return [
-            _with_failures(
-                spec, subject_chunk, part, evaluation_result(part, subject_chunk[1].episodes, subject_chunk[1].first)
-            )
+            _told(spec, subject_chunk, part, evaluation_result(part, subject_chunk[1].episodes, subject_chunk[1].first))
             for part, subject_chunk in zip(parts, work, strict=True)
         ]
 
@@ -210,7 +206,7 @@ def _policy_results(
         _, episode_L = slots(subject, chunk)
         part = episodes.part(slice(start, start + len(episode_L)))
         result = policies_result(part, episode_L == 0 if subject.traces else None)
-        results.append(_with_failures(spec, (subject, chunk), part, result))
+        results.append(_told(spec, (subject, chunk), part, result))
         start += len(episode_L)
     return results
 
@@ -234,12 +230,10 @@ def lane_name(spec: WorkerSpec, work: Work, lane: int) -> str:
     raise TypeError(f"{chunk_name(chunk)} has no episodes")
 
 
-def _with_failures(spec: WorkerSpec, work: Work, episodes: Episodes, result: EpisodesResult) -> EpisodesResult:
-    """The result of a chunk with the first of its failed episodes by name."""
-    if not episodes.failures:
-        return result
+def _told(spec: WorkerSpec, work: Work, episodes: Episodes, result: EpisodesResult) -> EpisodesResult:
+    """The result of a chunk with its address, and with the first of its failed episodes by name."""
     told = episodes.failures[:FAILURES_TOLD]
-    return replace(result, failures=tuple(f"{lane_name(spec, work, lane)} {text}" for lane, text in told))
+    return addressed(work, result, tuple(f"{lane_name(spec, work, lane)} {text}" for lane, text in told))
 
 
 def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:

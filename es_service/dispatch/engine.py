@@ -12,7 +12,6 @@ import os
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import events
@@ -34,7 +33,7 @@ from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 from es_service.protocol.parent import require_same_process
-from es_service.protocol.pieces import pieces_of, separated, together, whole
+from es_service.protocol.pieces import pieces_of, together
 from es_service.protocol.policies import POLICY_SLOTS
 
 _LOG = logger(__name__)
@@ -210,7 +209,8 @@ class Engine(Generic[AnyTransport]):
             self._serve()
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        """Results of chunks in the order of `work`; a work item has neighbouring chunks of one kind.
+        """Results of chunks in the order of `work`; a work item has neighbouring chunks of one kind. Chunks of episodes
+        may have been cut, or put together: their results say by addresses whose they are.
 
         They do not depend on the number of workers or on faults. After an exception, only `close` may be called.
 
@@ -234,8 +234,9 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         self._phase += 1
         episodes = self._state.limits.episodes_together
-        pieces = [[subject_chunk] if episodes is None else pieces_of(subject_chunk, episodes) for subject_chunk in work]
-        parts = self._parts([piece for of_chunk in pieces for piece in of_chunk])
+        if episodes is not None:
+            work = [piece for subject_chunk in work for piece in pieces_of(subject_chunk, episodes)]
+        parts = self._parts(work)
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         policies = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
         self._work, self._results = {item_id: together(part, policies) for item_id, part in parts}, {}
@@ -245,11 +246,7 @@ class Engine(Generic[AnyTransport]):
         def wait() -> list[ChunkResult]:
             while pending(self._state):
                 self._serve()
-            results = (result for item_id, part in parts for result in separated(part, self._results.pop(item_id)))
-            return [
-                whole(subject_chunk, list(islice(results, len(own))))
-                for subject_chunk, own in zip(work, pieces, strict=True)
-            ]
+            return [result for item_id, _ in parts for result in self._results.pop(item_id)]
 
         return wait
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from es_service.loop.checks import valid_members
 from es_service.loop.evaluated import Update
-from es_service.loop.generation import entered, steps_of
+from es_service.loop.generation import entered, episodes_of, steps_of
 from es_service.loop.history import CORRECTED, HistoryRow, doubles
 from es_service.loop.interfaces import Search
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.policies import policy_work
 from es_service.loop.state import RunState
 from es_service.protocol.evaluator import Requests
 from es_service.protocol.messages import EpisodesResult
@@ -103,5 +103,4 @@ def _episodes(search: Search, elites: list[Elite], generation: int, ask: int) ->
         ask=ask,
         domain=Domain.CORRECTION_RESET,
     )
-    results = yield work.work
-    return policy_episodes(work, [result for result in results if isinstance(result, EpisodesResult)])
+    return (yield from episodes_of([(work.work, work.shape)]))[0][0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from es_service.loop.checks import valid_members
 from es_service.loop.generation import first_episode, highest, steps_of
 from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, with_gaps
 from es_service.loop.policies import PolicyWork, no_statistics, policy_work
-from es_service.protocol.episodes import each, joined
+from es_service.protocol.episodes import joined
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.maps.behaviour_map import EMPTY
@@ -112,10 +112,11 @@ class Update:
 
 
 def policies_asked(
-    config: RunConfig, task: TaskSpec, generation: int, asks: Iterable[Ask | PolicyAsk]
+    config: RunConfig, task: TaskSpec, generation: int, asks: Sequence[Ask | PolicyAsk]
 ) -> list[PolicyWork]:
     """The policies among what a search asks for."""
     policies: list[PolicyWork] = []
+    populations = sum(isinstance(asked, Ask) for asked in asks)
     for asked in asks:
         if isinstance(asked, PolicyAsk):
             statistics = no_statistics(len(asked.parameters_N_D), task.observation_size)
@@ -129,6 +130,7 @@ def policies_asked(
                     seed=config.seed,
                     generation=generation,
                     ask=len(policies),
+                    request=populations + len(policies),
                     traces=True,
                 )
             )
@@ -202,7 +204,7 @@ def _one(
     return Evaluated(
         (point,),
         np.array([index]),
-        replace(each(lambda array: array[None], evaluation), of_steps=evaluation.of_steps),
+        evaluation,
         np.array([resets]),
         np.array([float(fitness_weight)]),
         np.array([population_max]),

@@ -19,9 +19,9 @@ from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError
 from es_service.loop.checks import require_state
 from es_service.loop.interfaces import Search
-from es_service.loop.policies import PolicyWork, policy_episodes
+from es_service.loop.policies import PolicyWork
 from es_service.loop.state import Best, RunState, statistics_in_force
-from es_service.protocol.episodes import joined
+from es_service.protocol.episodes import gathered
 from es_service.protocol.evaluator import Requests
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
@@ -103,18 +103,13 @@ def evaluate_populations(
     """
     asked = [
         with_subject(
-            centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)]
+            centre, [TrainingChunk(centre.generation, chunk_id, ask, ask) for chunk_id in range(count // chunk_pairs)]
         )
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
-    answers = yield from _evaluate(EpisodesResult, [*asked, *(policy_work.work for policy_work in policies)])
-    trained, of_policies = answers[: len(asked)], answers[len(asked) :]
-    moments = [result.moments for results in trained for result in results if result.moments is not None]
-    return (
-        [joined(results, count) for results, count in zip(trained, pairs, strict=True)],
-        moments,
-        [policy_episodes(policy_work, results) for policy_work, results in zip(policies, of_policies, strict=True)],
-    )
+    populations = zip(asked, [(count,) for count in pairs], strict=True)
+    results, moments = yield from episodes_of([*populations, *((of_ask.work, of_ask.shape) for of_ask in policies)])
+    return results[: len(asked)], moments, results[len(asked) :]
 
 
 def evaluate_centres(
@@ -124,7 +119,7 @@ def evaluate_centres(
     resets: Literal["by_ask", "by_chunk", "same"] = "by_ask",
     first: int = 0,
 ) -> Requests[list[EpisodesResult]]:
-    """Roll out each unperturbed centre: results with axis [E].
+    """Roll out each unperturbed centre: results with axes [1, E].
 
     Args:
         resets: which random streams the episodes start from. Each centre has its own, addressed by its ask or, in
@@ -136,9 +131,9 @@ def evaluate_centres(
         start, ask = first, index if resets == "by_ask" else 0
         if resets == "by_chunk":
             start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
-        asked.append(with_subject(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
-    answers = yield from _evaluate(EpisodesResult, asked)
-    return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in answers]
+        chunks = evaluation_chunks(centre.generation, episodes, first=start, ask=ask, request=index)
+        asked.append((with_subject(centre, chunks), (1, episodes)))
+    return (yield from episodes_of(asked))[0]
 
 
 def first_episode(centre: int, episodes: int) -> int:
@@ -163,10 +158,11 @@ def estimate_gradients(generation: int, weights: Sequence[FloatArray], block_pai
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
             chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
         asked.append(with_subject(NO_CENTRE, chunks))
-    answers = yield from _evaluate(GradientResult, asked)
+    work = [subject_chunk for of_ask in asked for subject_chunk in of_ask]
+    nodes = iter((yield from _computed(GradientResult, work)))
     return [
-        tree_sum(results) * np.float32(1.0 / weights_P.size)
-        for results, weights_P in zip(answers, weights, strict=True)
+        tree_sum(list(islice(nodes, len(of_ask)))) * np.float32(1.0 / weights_P.size)
+        for of_ask, weights_P in zip(asked, weights, strict=True)
     ]
 
 
@@ -195,15 +191,26 @@ def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
     return max(0.0, both / length) if length > 0.0 else 0.0
 
 
-def _evaluate(kind: type[Result], asked: Sequence[Sequence[Work]]) -> Requests[list[list[Result]]]:
-    """The results of each ask's chunks; all are computed side by side."""
-    if not (work := [subject_chunk for of_ask in asked for subject_chunk in of_ask]):
-        return []
-    results = yield work
+def episodes_of(
+    asked: Sequence[tuple[Sequence[Work], tuple[int, ...]]],
+) -> Requests[tuple[list[EpisodesResult], list[Moments]]]:
+    """Results of episodes of several requests, side by side, and the moments of their observations in the order of the
+    chunks.
+
+    Args:
+        asked: the chunks of each request, which have its index, and its leading axes as in `gathered`.
+    """
+    results = yield from _computed(EpisodesResult, [subject_chunk for work, _ in asked for subject_chunk in work])
+    moments = [result.moments for result in results if result.moments is not None]
+    return gathered([shape for _, shape in asked], results), moments
+
+
+def _computed(kind: type[Result], work: Sequence[Work]) -> Requests[list[Result]]:
+    """Results of chunks of one kind."""
+    results = (yield work) if work else []
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
-    remaining = iter(checked)
-    return [list(islice(remaining, len(work))) for work in asked]
+    return checked
 
 
 def tell(algorithm: Algorithm, state: SearchState, told: Sequence[CentreEvaluation]) -> SearchState:

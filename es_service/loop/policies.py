@@ -1,4 +1,4 @@
-"""Policies that are evaluated as they are: the chunks in which they travel to the workers, and their results.
+"""Policies that are evaluated as they are: the chunks in which they travel to the workers.
 
 Axes: N policies, E episodes, D policy parameters, O observation, T points of a trace, B descriptor dimensions.
 """
@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
@@ -29,6 +28,11 @@ class PolicyWork:
     work: list[Work]
     _made: dict[int, FloatArray] = field(default_factory=dict)
     """Parameters of policies that were made of their recipes here."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of the policies and of the episodes of each."""
+        return len(self.parameters_N_D), self.episodes
 
     def policies(self, numbers: Sequence[int]) -> list[Centre]:
         """Some of the policies, each as a centre without a population, in arrays that are not parts of others."""
@@ -58,6 +62,7 @@ def policy_work(
     seed: int,
     generation: int,
     ask: int = 0,
+    request: int = 0,
     traces: bool = False,
     domain: Domain = Domain.EVALUATION_RESET,
 ) -> PolicyWork:
@@ -69,6 +74,7 @@ def policy_work(
     Args:
         parameters_N_D: parameters of each, or recipes.
         statistics: mean and standard deviation of observations, [N, O] each.
+        request: index of the ask among all that is computed side by side.
     """
     work: list[Work] = []
     mean_N_O, std_N_O = statistics
@@ -81,7 +87,9 @@ def policy_work(
         of_each = () if has_none else (np.ascontiguousarray(array[of]) for array in statistics)
         policies = Policies(first, episodes, seed, traces, given, *of_each, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
-        work += with_subject(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
+        work += with_subject(
+            policies, [PolicyChunk(generation, len(work) + part, ask, part, request=request) for part in parts]
+        )
     return PolicyWork(parameters_N_D, *statistics, episodes, work)
 
 
@@ -89,32 +97,6 @@ def no_statistics(policies: int, observation_size: int) -> tuple[FloatArray, Flo
     """The observation statistics of policies that have none: mean 0 and standard deviation 1, [N, O] each."""
     shape = policies, observation_size
     return np.zeros(shape, np.float32), np.ones(shape, np.float32)
-
-
-def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> EpisodesResult:
-    """The results of all chunks in one, with axes [N, E]; traces, if there are any, are [N, T, B]."""
-    policies, episodes = len(asked.parameters_N_D), asked.episodes
-    whole = policies // POLICY_SLOTS * POLICY_SLOTS
-
-    def by_policy(flat: np.ndarray) -> np.ndarray:
-        full, last = flat[: whole * episodes], flat[whole * episodes :]
-        full = full.reshape(-1, episodes, POLICY_SLOTS, *flat.shape[1:]).swapaxes(1, 2)
-        last = last.reshape(episodes, policies - whole, *flat.shape[1:]).swapaxes(0, 1)
-        return np.concatenate([full.reshape(whole, *full.shape[2:]), last])
-
-    traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
-    flat = joined(results, traces=False)
-    reshaped = replace(each(by_policy, flat), trace_T_B=np.concatenate(traces) if traces else None)
-    if not flat.of_steps:
-        return reshaped
-    row_K = _rows(by_policy(np.cumsum(flat.steps) - flat.steps), reshaped.steps)
-    return replace(reshaped, of_steps={name: array[row_K] for name, array in flat.of_steps.items()})
-
-
-def _rows(first_N_E: np.ndarray, count_N_E: np.ndarray) -> np.ndarray:
-    """Indices from each `first` on, `count` of them, one range after another."""
-    first, count = first_N_E.reshape(-1), count_N_E.reshape(-1).astype(np.int64)
-    return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite value makes the policy invalid

@@ -202,6 +202,8 @@ class TrainingChunk:
     chunk_id: int
     ask: int = 0
     """Index of the population in its generation. Every population has random streams of its own."""
+    request: int = 0
+    """Whose rows its results are: the index of what is asked for, among all that is computed side by side."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,8 @@ class EvaluationChunk:
     """Number of episodes that are wanted among the chunk's 16. The shape that is compiled has all of them."""
     first: int = 0
     """The first of them, if this is a piece of a chunk (`protocol.pieces`)."""
+    request: int = 0
+    """As for training."""
 
 
 @dataclass(frozen=True)
@@ -231,11 +235,15 @@ class GradientChunk:
     """As for training."""
 
 
-def evaluation_chunks(generation: int, episodes: int, *, first: int = 0, ask: int = 0) -> list[EvaluationChunk]:
+def evaluation_chunks(
+    generation: int, episodes: int, *, first: int = 0, ask: int = 0, request: int = 0
+) -> list[EvaluationChunk]:
     """The chunks of a centre's evaluation, with ids from `first` on."""
     size = EVALUATION_EPISODES_PER_CHUNK
-    starts = range(0, episodes, size)
-    return [EvaluationChunk(generation, first + i, ask, min(size, episodes - start)) for i, start in enumerate(starts)]
+    return [
+        EvaluationChunk(generation, first + i, ask, min(size, episodes - start), request=request)
+        for i, start in enumerate(range(0, episodes, size))
+    ]
 
 
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk | PolicyChunk
@@ -299,7 +307,8 @@ class Moments:
 
 @dataclass(frozen=True)
 class EpisodesResult:
-    """Result of a training chunk, an evaluation chunk or a policy chunk.
+    """Result of a training chunk, an evaluation chunk or a policy chunk: rows of a request. `episodes.gathered` makes
+    one of all rows of a request.
 
     A training chunk's arrays have leading axes [P, S] and are over the member's episodes. The arrays of other chunks
     are of single episodes: [E] of the centre, or [L] of the policies in a chunk's slots.
@@ -337,6 +346,11 @@ class EpisodesResult:
     failures: tuple[str, ...] = ()
     """Invalid episodes of which the rollout knows why they are invalid, each as a text that names the member, its seed,
     its parameters and the reason; at most FAILURES_TOLD of a chunk."""
+    request: int = 0
+    """As in the chunk."""
+    row_N: NDArray[np.intp] | None = None
+    """Numbers of these rows among those of the request, whose first need not be 0: of pairs, of the centre's episodes,
+    or of policies' episodes, all of the first policy, all of the second, ... None: they are all of them."""
 
 
 @dataclass(frozen=True)

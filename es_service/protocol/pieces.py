@@ -1,22 +1,18 @@
 """Evaluation and policy chunks in pieces, for tasks whose episodes may take long: each piece can go to another worker.
 And policy chunks that are several in one, for tasks whose episodes take less than a message.
 
-The numbers of episodes and slots stay those of the whole chunk, and so do the results, as far as the bits of an episode
-do not depend on the others that are computed with it.
+Results know the addresses of their rows (`protocol.episodes`), so nobody needs to know how chunks were cut. They stay
+those of the whole chunks, as far as the bits of an episode do not depend on the others that are computed with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
-from es_service.protocol.episodes import joined, part_of
 from es_service.protocol.messages import (
-    ChunkResult,
-    EpisodesResult,
     EvaluationChunk,
     Policies,
     PolicyChunk,
@@ -24,7 +20,7 @@ from es_service.protocol.messages import (
     Work,
     recipes_in,
 )
-from es_service.protocol.policies import slots
+from es_service.protocol.policies import POLICY_SLOTS, slots
 from es_service.protocol.recipes import Recipes
 
 
@@ -44,18 +40,6 @@ def pieces_of(work: Work, most: int) -> list[Work]:
             (subject, replace(chunk, first=chunk.first + start, count=min(most, count - start))) for start in starts
         ]
     return [work]
-
-
-def whole(work: Work, results: Sequence[ChunkResult]) -> ChunkResult:
-    """The result of a chunk from those of its pieces."""
-    episodes = [result for result in results if isinstance(result, EpisodesResult)]
-    if len(results) == 1 or len(episodes) < len(results):
-        return results[0]
-    traces = [result.trace_T_B for result in episodes if result.trace_T_B is not None]
-    combined = joined(episodes, traces=False)
-    if not traces:
-        return combined
-    return replace(combined, trace_T_B=np.concatenate(traces) if isinstance(work[1], PolicyChunk) else traces[0])
 
 
 def together(work: Sequence[Work], most: int) -> list[Work]:
@@ -109,27 +93,6 @@ def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
         and subject.observation_mean_N_O is before.observation_mean_N_O is None
         and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
         and chunk == replace(last, chunk_id=last.chunk_id + 1)
-        and chunk == PolicyChunk(chunk.generation, chunk.chunk_id, chunk.ask)
+        and isinstance(chunk, PolicyChunk)
+        and (chunk.part, chunk.first, chunk.count) == (0, 0, POLICY_SLOTS)
     )
-
-
-def separated(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[ChunkResult]:
-    """The results of each chunk from those of a work item as it was sent."""
-    if len(results) == len(work):
-        return list(results)
-    chunk_results: list[ChunkResult] = []
-    for result in results:
-        if not isinstance(result, EpisodesResult):
-            chunk_results.append(result)
-            continue
-        ends = [0]
-        while ends[-1] < len(result.fitness):
-            subject, chunk = work[len(chunk_results) + len(ends) - 1]
-            assert isinstance(subject, Policies)
-            assert isinstance(chunk, PolicyChunk)
-            ends.append(ends[-1] + len(slots(subject, chunk)[0]))
-        chunk_results += [
-            replace(part_of(result, slice(first, end)), failures=() if first else result.failures)
-            for first, end in pairwise(ends)  # the first have the failures of all
-        ]
-    return chunk_results

@@ -68,6 +68,8 @@ class PolicyChunk:
     count: int = POLICY_SLOTS
     """First wanted slot and number of wanted slots, if this is a piece of a chunk, or several chunks in one
     (`protocol.pieces`)."""
+    request: int = 0
+    """As of a training chunk."""
 
 
 def chunks_of(policies: int, episodes: int) -> int:

@@ -246,8 +246,8 @@ def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list
         count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
         results = completed(evaluate_centres(centres, count, resets="same", first=first), engine.evaluate)
         parts = [
-            (moments_of(result.fitness), moments_of(result.descriptor), int(np.sum(result.outputs.get("success", 0))))
-            for result in results
+            (moments_of(of.fitness[0]), moments_of(of.descriptor[0]), int(np.sum(of.outputs.get("success", 0))))
+            for of in results
         ]
         totals = list(map(_added, totals, parts)) if totals else parts
     return totals

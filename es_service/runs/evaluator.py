@@ -25,7 +25,8 @@ from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, EvaluationError
 from es_service.logs import logger
 from es_service.loop.checks import valid_members
-from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
 from es_service.protocol.parent import require_same_process
@@ -170,7 +171,7 @@ class PolicyEvaluator:
             except BaseException as error:  # an interrupt ends whatever uses the evaluator
                 self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
                 raise
-        result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
+        (result,) = gathered([asked.shape], [answer for answer in answers if isinstance(answer, EpisodesResult)])
         return PolicyEvaluations(
             result.fitness,
             result.returns,

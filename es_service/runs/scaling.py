@@ -28,6 +28,7 @@ from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
+from es_service.protocol.episodes import addressed, each
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
@@ -36,14 +37,13 @@ from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
     GradientChunk,
-    Subject,
     TrainingChunk,
     Work,
     WorkerPlace,
     WorkerSpec,
     evaluation_chunks,
 )
-from es_service.protocol.policies import Policies, PolicyChunk, slots
+from es_service.protocol.policies import Policies
 from es_service.runs.resume_checks import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
@@ -251,15 +251,17 @@ def _message_costs(
     return message_s, way_s, chunk_message_s
 
 
-def _of_slots(answer: ChunkResult, subject: Subject, chunk: Chunk) -> ChunkResult:
-    """The recorded answer for a chunk of policies that may have fewer slots, and traces only of first episodes."""
-    if not (isinstance(answer, EpisodesResult) and isinstance(subject, Policies) and isinstance(chunk, PolicyChunk)):
+def _for_chunk(answer: ChunkResult, work: Work) -> ChunkResult:
+    """The recorded answer for a chunk that may have fewer episodes, and traces only of first ones."""
+    if not isinstance(answer, EpisodesResult):
         return answer
-    _, episode_L = slots(subject, chunk)
-    names = "fitness", "returns", "descriptor", "steps", "goal_distance"
-    columns = {name: getattr(answer, name)[: len(episode_L)] for name in names}
-    firsts, trace_T_B = int((episode_L == 0).sum()), answer.trace_T_B
-    return replace(answer, **columns, trace_T_B=None if trace_T_B is None else trace_T_B[:firsts])
+    row_N = addressed(work, answer).row_N
+    assert row_N is not None
+    (subject, _), trace_T_B = work, answer.trace_T_B
+    if isinstance(subject, Policies) and trace_T_B is not None:
+        trace_T_B = trace_T_B[: int((row_N % subject.episodes == 0).sum())]
+    cut = each(lambda array: array[: len(row_N)], answer, traces=False)
+    return addressed(work, replace(cut, moments=answer.moments, trace_T_B=trace_T_B))
 
 
 def _moved(answer: ChunkResult, random: np.random.Generator, bounds_B_2: np.ndarray) -> ChunkResult:
@@ -342,7 +344,7 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
                 next(session)
                 beside_s += time.perf_counter() - sent
                 results = [
-                    _of_slots(next(replayed[_kind(subject_chunk)]), *subject_chunk) for subject_chunk in work or ()
+                    _for_chunk(next(replayed[_kind(subject_chunk)]), subject_chunk) for subject_chunk in work or ()
                 ]
     driver_s, beside_s = map(float, np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0))
     return driver_s, beside_s

@@ -13,10 +13,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.generation import episodes_of
+from es_service.loop.policies import policy_work
 from es_service.protocol.episodes import part_of
-from es_service.protocol.evaluator import Evaluator
-from es_service.protocol.messages import EpisodesResult, FloatArray, Work
+from es_service.protocol.evaluator import Evaluator, completed
+from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain
 from es_service.runs.intervals import mean_interval, share_interval
 
@@ -151,13 +152,12 @@ def results_of(
             seed=seed,
             generation=number,
             ask=ask,
+            request=request,
             domain=domain,
         )
-        for parameters_D, mean_O, std_O in policies
+        for request, (parameters_D, mean_O, std_O) in enumerate(policies)
     ]
-    work: list[Work] = [subject_chunk for each in asked for subject_chunk in each.work]
-    answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
-    results = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
+    results, _ = completed(episodes_of([(each.work, each.shape) for each in asked]), engine.evaluate)
     return [part_of(result, 0) for result in results]
 
 

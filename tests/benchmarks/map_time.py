@@ -26,6 +26,7 @@ from es_service.config.workload import policy_spec
 from es_service.loop import driver
 from es_service.loop.history import history_columns
 from es_service.loop.parts import Arrays, cell_part, elite_part, elite_to_arrays
+from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
@@ -54,18 +55,20 @@ class Inventing(AtTheEnd):
     def evaluate(self, work):
         place_2 = self._rng.uniform(*self._bounds)
         self._centres += isinstance(work[0][1], GradientChunk)
-        return [self._answer(chunk, place_2) for _, chunk in work]
+        return [self._answer(*subject_chunk, place_2) for subject_chunk in work]
 
-    def _answer(self, chunk, place_2):
+    def _answer(self, subject, chunk, place_2):
         if isinstance(chunk, GradientChunk):
             return GradientResult(self._sum_D)
         training = isinstance(chunk, TrainingChunk)
-        axes = (self._pairs, 2) if training else (16,)
+        axes = (self._pairs, 2) if training else (chunk.episodes,)
         fitness = self._rng.normal(size=axes).astype(np.float32) if training else np.full(axes, self._centres, "f4")
         spread = self._rng.normal(size=(*axes, 2)) * (0.1 if training else 0.0)
         descriptor = (place_2 + spread).astype(np.float32)
         trace = None if training else np.zeros((64, 2), np.float32)
-        return EpisodesResult(fitness, fitness, descriptor, np.full(axes, 200, np.int32), descriptor, self._none, trace)
+        steps = np.full(axes, 200, np.int32)
+        result = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, self._none, trace)
+        return addressed((subject, chunk), result)
 
 
 def filled(parts: dict[str, Arrays], parameters: int, observations: int) -> dict[str, Arrays]:

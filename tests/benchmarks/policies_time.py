@@ -31,10 +31,11 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
+from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.kept_parents import KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.messages import EpisodesResult, Work, WorkerSpec
-from es_service.protocol.pieces import separated, together
+from es_service.protocol.pieces import together
 from es_service.protocol.policies import POLICIES_TOGETHER, PolicyChunk, slots
 from es_service.protocol.wire import framed
 from es_service.search.algorithms import ALGORITHMS
@@ -69,7 +70,7 @@ class Inventing(AtTheEnd):
         if self._workers and work:
             frames = map(_frames, _halves(work), self._workers)
             self.sent_bytes.append(sum(len(frame) for of_worker in frames for frame in of_worker))
-        return [self._answer(*subject_chunk) for subject_chunk in work]
+        return [addressed(subject_chunk, self._answer(*subject_chunk)) for subject_chunk in work]
 
     def _answer(self, subject, chunk):
         slots_L = len(slots(subject, chunk)[0]) if isinstance(chunk, PolicyChunk) else chunk.episodes
@@ -107,7 +108,7 @@ class Working(AtTheEnd):
         frames = timed(_frames, self._spent, "send")(work, theirs)
         results = self._run(timed(_read, self._spent, "read")(frames, extra))
         answer = timed(framed, self._spent, "answer")(results)
-        return timed(lambda frame: separated(work, pickle.loads(frame[8:])), self._spent, "hear")(answer)
+        return timed(lambda frame: pickle.loads(frame[8:]), self._spent, "hear")(answer)
 
 
 def _halves(work: Sequence[Work]) -> list[Sequence[Work]]:

@@ -43,7 +43,8 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk, WorkerSpec, with_subject
 from tests.helpers import centre
@@ -74,7 +75,7 @@ def measure_policies(engine: Evaluator, parameters_N_D: Any, observation_size: i
     statistics = no_statistics(len(parameters_N_D), observation_size)
     while time.perf_counter() - start < seconds or not generation:
         asked = policy_work(parameters_N_D, statistics, 1, seed=0, generation=(generation := generation + 1))
-        steps += int(policy_episodes(asked, engine.evaluate(asked.work)).steps.sum())
+        steps += int(gathered([asked.shape], engine.evaluate(asked.work))[0].steps.sum())
     return steps / (time.perf_counter() - start)
 
 

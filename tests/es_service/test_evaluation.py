@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.api import open_run
+from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk
 from es_service.runs import evaluation
@@ -26,7 +27,7 @@ class Invented:
         self.alive, self.most, self.seen, self.wrong = 0, 0, [], wrong
 
     def evaluate(self, work):
-        return [self._result(chunk) for _, chunk in work]
+        return [addressed((subject, chunk), self._result(chunk)) for subject, chunk in work]
 
     def _result(self, chunk: EvaluationChunk) -> EpisodesResult:
         number_E = chunk.chunk_id * 16 + np.arange(chunk.episodes)

@@ -1,4 +1,4 @@
-"""Chunks in pieces have the results of the whole chunks, whatever the size of the pieces and the workers."""
+"""However chunks are cut or put together, the rows of a request are the same: results know their addresses."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import pytest
 
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, evaluation_chunks, with_subject
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.pieces import pieces_of, separated, together, whole
+from es_service.protocol.pieces import pieces_of, together
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recipes import IsoLine, recipes_of
 from tests.helpers import centre, random_parameters, spec
@@ -28,42 +29,74 @@ DRIFT = spec(
 )
 
 
-@pytest.mark.parametrize("most", [1, 3, 5, 16, 40])
-def test_the_results_of_pieces_are_those_of_whole_chunks(most):
-    run, size = make_worker(DRIFT), DRIFT.policy.parameters
-    subject = centre(random_parameters(0, size), observation_size=3)
-    parameters_N_D = np.stack([random_parameters(seed, size) for seed in range(21)])
-    statistics = np.zeros((21, 3), np.float32), np.ones((21, 3), np.float32)
-    asked = policy_work(parameters_N_D, statistics, 3, seed=3, generation=2, traces=True)
-    work = [*with_subject(subject, evaluation_chunks(2, 23)), *asked.work]
-    for one in work:
-        pieces, [expected] = pieces_of(one, most), run([one])
-        results = [result for piece in pieces for result in run([piece])]
-        assert max(len(result.fitness) for result in results) == min(most, len(expected.fitness))
-        found = whole(one, results)
-        for name in ("fitness", "returns", "descriptor", "steps", "trace_T_B"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-        for name in ("outputs", "of_steps"):
-            for key, array in getattr(expected, name).items():
-                np.testing.assert_array_equal(getattr(found, name)[key], array, err_msg=key)
+ROWS = "fitness", "returns", "descriptor", "steps", "trace_T_B"
+
+
+def assert_same(one, other):
+    for name in ROWS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name in ("outputs", "of_steps"):
+        for key, array in getattr(other, name).items():
+            np.testing.assert_array_equal(getattr(one, name)[key], array, err_msg=key)
+
+
+def drifting(policies: int, episodes: int):
+    """Chunks of a centre and of policies, and the leading axes of both requests."""
+    subject = centre(random_parameters(0, DRIFT.policy.parameters), observation_size=3)
+    parameters_N_D = np.stack([random_parameters(seed, DRIFT.policy.parameters) for seed in range(policies)])
+    statistics = np.zeros((policies, 3), np.float32), np.ones((policies, 3), np.float32)
+    asked = policy_work(parameters_N_D, statistics, episodes, seed=3, generation=2, request=1, traces=True)
+    work = [*with_subject(subject, evaluation_chunks(2, 23, first=4)), *asked.work]
+    return work, [(1, 23), asked.shape]
+
+
+@pytest.mark.parametrize(("most", "policies"), [(1, 21), (3, 5), (5, 35), (16, 21), (40, 21)])
+def test_pieces_in_any_order_have_the_rows_of_whole_chunks(most, policies):
+    run = make_worker(DRIFT)
+    work, shapes = drifting(policies, 3)
+    results = [result for one in work for piece in pieces_of(one, most) for result in run([piece])]
+    assert max(len(result.fitness) for result in results) == min(most, POLICY_SLOTS)
+    np.random.default_rng(most).shuffle(results)
+    for found, shape, expected in zip(gathered(shapes, results), shapes, gathered(shapes, run(work)), strict=True):
+        assert found.fitness.shape == shape
+        assert found.trace_T_B is not None
+        assert found.trace_T_B.shape[0] == shape[0]
+        assert_same(found, expected)
+    subject = work[0][0]
     for chunk in (TrainingChunk(1, 0), GradientChunk(1, 0, np.ones(4, np.float32))):
         assert pieces_of((subject, chunk), most) == [(subject, chunk)]
 
 
-def test_an_engine_puts_together_what_it_has_sent_in_pieces():
-    subject = centre(random_parameters(0, DRIFT.policy.parameters), observation_size=3)
-    parameters_N_D = np.stack([random_parameters(seed, DRIFT.policy.parameters) for seed in range(20)])
-    statistics = np.zeros((20, 3), np.float32), np.ones((20, 3), np.float32)
-    asked = policy_work(parameters_N_D, statistics, 2, seed=3, generation=2, traces=True)
-    work = [*with_subject(subject, [TrainingChunk(1, 0), *evaluation_chunks(2, 20)]), *asked.work]
+def test_rows_are_those_of_single_episodes():
+    """Each row of a request is what its policy and its episode have alone."""
+    run, (work, shapes) = make_worker(DRIFT), drifting(5, 3)
+    _, all_ = gathered(shapes, run(work))
+    subject = work[-1][0]
+    for policy, first in ((0, 0), (3, 3), (4, 4)):
+        alone = replace(subject, first=first, parameters_N_D=subject.parameters_N_D[policy : policy + 1])
+        alone = replace(alone, observation_mean_N_O=None, observation_std_N_O=None)
+        (one,) = gathered([(1, 3)], run([(alone, replace(work[-1][1], chunk_id=0, request=0))]))
+        np.testing.assert_array_equal(one.fitness[0], all_.fitness[policy])
+        np.testing.assert_array_equal(one.trace_T_B[0], all_.trace_T_B[policy])
+        np.testing.assert_array_equal(one.steps[0], all_.steps[policy])
+
+
+def test_a_row_that_is_missing_or_comes_twice_is_no_result():
+    work, shapes = drifting(5, 3)
+    results = make_worker(DRIFT)(work)
+    for wrong in (results[1:], [*results, results[-1]]):
+        with pytest.raises((AssertionError, ValueError)):
+            gathered(shapes, wrong)
+
+
+def test_an_engine_cuts_what_workers_compute():
+    work, shapes = drifting(20, 2)
     found = []
     for limits in (Limits(1), replace(Limits(2), episodes_together=1)):
         with inline_engine(DRIFT, limits) as engine:
-            results = engine.evaluate(work)
-        found.append((results[:3], policy_episodes(asked, results[3:])))
-    for one, other in zip((*found[0][0], found[0][1]), (*found[1][0], found[1][1]), strict=True):
-        np.testing.assert_array_equal(one.fitness, other.fitness)
-        np.testing.assert_array_equal(one.trace_T_B, other.trace_T_B)
+            found.append(gathered(shapes, engine.evaluate(work)))
+    for one, other in zip(*found, strict=True):
+        assert_same(one, other)
 
 
 MAZE = spec(policy=PolicySpec((2, 8, 2)), rollout="simd", outputs=("last_reward", "observation"))
@@ -89,12 +122,7 @@ def test_policies_with_one_episode_are_sent_as_one_chunk_and_have_the_results_of
     assert [len(subject.parameters_N_D) for subject, _ in sent] == sizes
     results, expected = run(sent), [result for one in asked.work for result in run([one])]
     assert [len(result.fitness) for result in results] == sizes
-    for found, wanted in zip(separated(asked.work, results), expected, strict=True):
-        for name in ("fitness", "returns", "descriptor", "steps", "trace_T_B"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
-        for name in ("outputs", "of_steps"):
-            for key, array in getattr(wanted, name).items():
-                np.testing.assert_array_equal(getattr(found, name)[key], array, err_msg=key)
+    assert_same(*(gathered([asked.shape], rows)[0] for rows in (results, expected)))
 
 
 def test_what_is_sent_has_the_parents_that_it_needs_and_no_others():
@@ -125,9 +153,9 @@ def test_only_neighbours_of_one_ask_are_one_chunk():
 @pytest.mark.slow
 def test_an_engine_sends_policies_together():
     asked = asked_for(70)
-    expected = policy_episodes(asked, make_worker(MAZE)(asked.work))
+    (expected,) = gathered([asked.shape], make_worker(MAZE)(asked.work))
     with inline_engine(MAZE, Limits(1, policies_together=128)) as engine:
         for _ in range(2):
-            found = policy_episodes(asked, engine.evaluate(asked.work))
+            (found,) = gathered([asked.shape], engine.evaluate(asked.work))
             np.testing.assert_array_equal(found.fitness, expected.fitness)
             np.testing.assert_array_equal(found.trace_T_B, expected.trace_T_B)

@@ -15,7 +15,8 @@ from es_service import api
 from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, RunLockedError, StoreError
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.policies import policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, stream_keys
@@ -64,7 +65,7 @@ def episodes_of(config, policy, episodes, number, ask, domain) -> EpisodesResult
     asked = policy_work(
         parameters_D, (mean_O, std_O), episodes, seed=config.seed, generation=number, ask=ask, domain=domain
     )
-    return policy_episodes(asked, [one for one in direct.evaluate(asked.work) if isinstance(one, EpisodesResult)])
+    return gathered([asked.shape], [one for one in direct.evaluate(asked.work) if isinstance(one, EpisodesResult)])[0]
 
 
 def selected(config, policies, number: int, keep: int) -> tuple[list[int], int]:

@@ -11,6 +11,7 @@ from es_service.api import load_config
 from es_service.config.workload import worker_spec
 from es_service.errors import EvaluationError
 from es_service.loop import driver
+from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import (
     EpisodesResult,
@@ -272,17 +273,18 @@ class Inventing(AtTheEnd):
         self.rng = np.random.default_rng(0)
 
     def evaluate(self, work):
-        return [self.answer(chunk) for _, chunk in work]
+        return [self.answer(*subject_chunk) for subject_chunk in work]
 
-    def answer(self, chunk):
+    def answer(self, subject, chunk):
         if isinstance(chunk, GradientChunk):
             return GradientResult(self.sum_D)
-        axes = (64, 2) if isinstance(chunk, TrainingChunk) else (16,)
+        axes = (64, 2) if isinstance(chunk, TrainingChunk) else (chunk.episodes,)
         fitness = self.rng.normal(size=axes).astype(np.float32)
         steps = np.full(axes, 200, np.int32)
         descriptor = np.zeros((*axes, 2), np.float32)
-        trace = np.zeros((64, 2), np.float32)
-        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2), trace)
+        trace = None if isinstance(chunk, TrainingChunk) else np.zeros((64, 2), np.float32)
+        result = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2), trace)
+        return addressed((subject, chunk), result)
 
 
 def test_the_driver_holds_no_population_times_parameters_array():

@@ -15,7 +15,8 @@ from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, StoreError
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.policies import policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, seed_for
 from es_service.runs import certification
@@ -71,7 +72,7 @@ def returns_of(config, policy, episodes, number, seed) -> np.ndarray:
     address = {"seed": seed, "generation": number, "domain": Domain.OTHER_TASK_RESET}
     asked = policy_work(parameters_D, (mean_O, std_O), episodes, **address)
     answers = [one for one in direct.evaluate(asked.work) if isinstance(one, EpisodesResult)]
-    return policy_episodes(asked, answers).returns[0]
+    return gathered([asked.shape], answers)[0].returns[0]
 
 
 def test_selection_is_that_without_another_task_whose_episodes_only_report(finished, copied, tmp_path):

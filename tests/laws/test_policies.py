@@ -10,7 +10,8 @@ import pytest
 
 from es_service import api
 from es_service.errors import EvaluationError
-from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import PolicyChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, PolicyAsk
@@ -71,7 +72,7 @@ def evaluated_alone(generation):
     given = (POLICIES + np.float32(generation), no_statistics(18, 2)), (OTHERS, (MEAN, STD))
     for ask, (policies, statistics) in enumerate(given):
         asked = policy_work(policies, statistics, EPISODES, seed=0, generation=generation, ask=ask, traces=True)
-        found.append(policy_episodes(asked, Sharing().evaluate(asked.work)))
+        found.append(gathered([asked.shape], Sharing().evaluate(asked.work))[0])
     return found
 
 

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, WorkerSpec
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
@@ -35,7 +36,7 @@ def evaluate(evaluator: Any, chosen: Any = slice(None), episodes: int = E, **add
     """Results [N, E] of some of the policies."""
     given = {"seed": 5, "generation": 9, **address}
     asked = policy_work(POLICIES[chosen], tuple(x[chosen] for x in STATISTICS), episodes, traces=True, **given)
-    return policy_episodes(asked, evaluator.evaluate(asked.work))
+    return gathered([asked.shape], evaluator.evaluate(asked.work))[0]
 
 
 def bits(result: EpisodesResult, chosen: Any = slice(None), episodes: Any = slice(None)) -> list[bytes]:
@@ -127,9 +128,9 @@ def test_policies_of_one_kind_in_any_order_of_chunks_give_the_same_bits(evaluato
     alone = [evaluator.evaluate([one])[0] for one in asked.work]
     order = np.random.default_rng(0).permutation(len(asked.work))
     shuffled = evaluator.evaluate([asked.work[at] for at in order])
-    whole = bits(policy_episodes(asked, together))
-    assert bits(policy_episodes(asked, alone)) == whole
-    assert bits(policy_episodes(asked, [shuffled[at] for at in np.argsort(order)])) == whole
+    whole = bits(gathered([asked.shape], together)[0])
+    assert bits(gathered([asked.shape], alone)[0]) == whole
+    assert bits(gathered([asked.shape], [shuffled[at] for at in np.argsort(order)])[0]) == whole
 
 
 def test_each_part_of_an_address_gives_other_resets_and_none_is_that_of_a_centre(evaluator):
@@ -138,7 +139,7 @@ def test_each_part_of_an_address_gives_other_resets_and_none_is_that_of_a_centre
 
     def returns(**address: int) -> list[float]:
         asked = policy_work(first, no_statistics(len(first), 2), 4, **{"seed": 3, "generation": 1, **address})
-        return policy_episodes(asked, evaluator.evaluate(asked.work)).returns.ravel().tolist()
+        return gathered([asked.shape], evaluator.evaluate(asked.work))[0].returns.ravel().tolist()
 
     found = [*returns(), *returns(seed=4), *returns(generation=2), *returns(ask=1)]
     centres = [(centre(first[0]), EvaluationChunk(1, 0, ask)) for ask in range(5)]
@@ -153,7 +154,7 @@ def test_several_generations_seeds_and_asks_in_one_work_item_are_kept_apart(eval
     asked = [policy_work(POLICIES[:3], tuple(x[:3] for x in STATISTICS), 2, **one) for one in given]
     results = evaluator.evaluate([one.work[0] for one in asked])
     for one, result, address in zip(asked, results, addresses, strict=True):
-        assert bits(policy_episodes(one, [result])) == bits(evaluate(evaluator, slice(3), 2, **address))
+        assert bits(gathered([one.shape], [result])[0]) == bits(evaluate(evaluator, slice(3), 2, **address))
 
 
 def test_xla_and_simd_agree(evaluator):

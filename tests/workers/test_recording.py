@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.policies import policy_work
+from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain
 from es_service.protocol.recordings import RecordRequest, Scene
@@ -40,14 +41,14 @@ def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
     centre = helpers.centre(parameters_N_D[0], generation=7, observation_size=size)
     mean_N_O, std_N_O = (np.tile(array, (19, 1)) for array in (centre.observation_mean_O, centre.observation_std_O))
     work = policy_work(parameters_N_D, (mean_N_O, std_N_O), 2, seed=5, generation=7, ask=1, traces=True)
-    policies = policy_episodes(work, [run(*one) for one in work.work])
+    policies = gathered([work.shape], [run(*one) for one in work.work])[0]
     asked = []
     for n in (0, 3, 18):
         request = RecordRequest(replace(centre, parameters_D=parameters_N_D[n]), seed=5, ask=1, policy=n)
         asked.append((request, policies, (n, 0), policies.trace_T_B[n]))
     domain = Domain.CERTIFICATION_RESET
     alone = policy_work(parameters_N_D[:1], (mean_N_O[:1], std_N_O[:1]), 19, seed=5, generation=7, domain=domain)
-    certified = policy_episodes(alone, [run(*one) for one in alone.work])
+    certified = gathered([alone.shape], [run(*one) for one in alone.work])[0]
     asked += [
         (RecordRequest(centre, seed=5, policy=0, episode=e, domain=domain), certified, (0, e), None) for e in (0, 3, 18)
     ]
