@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.padding import Padding
 
 from es_service import api
 from es_service.cli.commands import command
-from es_service.cli.console import console
+from es_service.cli.console import console, print_line
 from es_service.cli.data import catalogue_data, digest_data, print_json, status_data
 from es_service.cli.options import JsonOption, print_note
 from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, readable
@@ -17,11 +18,15 @@ from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import NOT_STARTED, print_overview
 from es_service.cli.tables.status import follow_status, print_status
 from es_service.config.given import shipped_text
+from es_service.config.keys import unknown_key
+from es_service.config.loading import described_keys
 from es_service.config.tasks import TASKS
+from es_service.config.text import one_of
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.system import given_path
 from es_service.runs.folders import runs_of
 from es_service.runs.run_status import newest_runs, read_status
+from es_service.search.algorithms import OURS
 from es_service.store import digest
 
 NEWEST = 10
@@ -104,10 +109,33 @@ def digest_(
 
 
 def config_(
-    name: Annotated[str, typer.Argument(help="Name of a shipped config, as `list` shows it.", show_default=False)],
+    name: Annotated[
+        str, typer.Argument(help="Name of a shipped config, as `list` shows it; with --keys, a key or section.")
+    ] = "",
+    keys: Annotated[bool, typer.Option("--keys", help="Describe the keys of configs instead.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Print a shipped config, which you can save as a file and edit."""
-    print(shipped_text(name), end="")
+    """Print a shipped config, which you can save as a file and edit, or what keys mean."""
+    if not keys:
+        if as_json:
+            raise ConfigError("--json is for --keys; a shipped config is YAML already")
+        print(shipped_text(name), end="")
+        return
+    everything = described_keys(OURS)
+    rows = [row for row in everything if f"{row.key}.".startswith(f"{name}." if name else "")]
+    if not rows:
+        problem = unknown_key(name, [row.key for row in everything], None)
+        raise ConfigError(problem.sentence, field=name, suggestion=problem.suggestion)
+    if as_json:
+        print_json([row._asdict() for row in rows])
+        return
+    for row in rows:
+        print_line(console, f"{row.key} = {row.default}", style="bold")
+        others, of_methods = [method for method in OURS if method not in row.methods], ""
+        if others and row.methods:
+            which = f"all but {one_of(others, 'and')}" if len(others) < len(row.methods) else one_of(row.methods, "and")
+            of_methods = f" A key of {which}."
+        console.print(Padding(f"{row.meaning} Must be {row.allowed}.{of_methods}", (0, 0, 0, 4)))
 
 
 def list_(as_json: JsonOption = False) -> None:

@@ -192,15 +192,15 @@ def key_problems(
         if key.startswith("search.") and methods_with(key, algorithms):
             return no_effect(key, value, given["search.algorithm"], algorithms)
         groups = GROUPS if isinstance(value, Mapping) else ()
-        unknown = _unknown_key(key, (*groups, *known), value)
+        unknown = unknown_key(key, (*groups, *known), value)
         if unknown.suggestion is None:
-            unknown = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
+            unknown = unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
         return unknown
 
     return {key: found for key, value in given.items() if (found := problem(key, value))}
 
 
-def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
+def unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     """The problem of an unknown key. It suggests the same name in another section, else the most similar key; if there
     is neither, it lists the keys of the section."""
     candidates = dict.fromkeys(candidates)

@@ -22,12 +22,14 @@ from es_service.config.given import Overrides, Source, by_key, nested, parse_ove
 from es_service.config.keys import (
     FIELDS,
     KIND,
+    SECTIONS,
     Methods,
     all_search_fields,
     has_effect,
     key_problems,
     kind_of,
     lacks,
+    methods_with,
     no_effect,
     parts_of,
     search_fields,
@@ -86,12 +88,13 @@ class Reading:
         """
         if self.problems or self.settings is None or self.task is None:
             raise ConfigError.listing(f"{self.name}: {counted(len(self.problems), 'problem')}", self.problems)
-        sections = nested(self.values.known())
-        if isinstance(start := self.values["search.init_from"], str):
+        values, given = self.values.known(), dict(self.given)
+        if isinstance(start := values["search.init_from"], str):
             # An absolute path, so that the stored config names the same run from every working directory.
-            sections["search"]["init_from"] = os.path.abspath(given_path(start))
+            values["search.init_from"] = given["search.init_from"] = os.path.abspath(given_path(start))
+        sections = nested(values)
         config = RunConfig.model_validate(sections | {"search": self.settings.model_validate(sections["search"])})
-        return config.made_of(Made(self.task, self.given, self.left_out, self.kept))
+        return config.made_of(Made(self.task, given, self.left_out, self.kept))
 
     @cached_property
     def idle(self) -> dict[str, str]:
@@ -375,3 +378,45 @@ def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:
     if annotation is NoneType:
         return "null"
     return one_of(parts)
+
+
+class DescribedKey(NamedTuple):
+    """A key of configs, for people."""
+
+    key: str
+    default: str
+    """In YAML, both presets with a slash between, or "required"; then those of methods that have another one."""
+    allowed: str
+    """What values are allowed, in words."""
+    methods: tuple[str, ...]
+    """The methods with which it has an effect."""
+    meaning: str
+
+
+def described_keys(algorithms: Methods) -> list[DescribedKey]:
+    """All keys, in the order of the sections: those of every config, then those of methods."""
+    described = []
+    for key, field in (FIELDS | all_search_fields(algorithms)).items():
+        methods = methods_with(key, algorithms)
+        defaults: dict[str, list[str]] = {}
+        for name in methods or algorithms:
+            defaults.setdefault(_default_text(key, algorithms[name].settings), []).append(name)
+        first = max(defaults, key=lambda text: len(defaults[text]))
+        others = [f"{text} with {one_of(names, 'and')}" for text, names in defaults.items() if text != first]
+        left_open = f"{LEFT_OPEN[key]} or " if LEFT_OPEN.get(key) else ""
+        allowed = f"{left_open}{_allowed(field.annotation, field.metadata)}"
+        described.append(DescribedKey(key, "; ".join([first, *others]), allowed, methods, field.description or ""))
+    meaning, allowed = SECTIONS["task"].model_fields["options"].description or "", "what the task declares"
+    described.append(DescribedKey(f"{TASK_OPTIONS}NAME", "the task's", allowed, tuple(algorithms), meaning))
+    sections = [*SECTIONS, *FIELDS]  # a key outside of sections is its own
+    return sorted(described, key=lambda row: sections.index(row.key.split(".")[0]))
+
+
+def _default_text(key: str, settings: type[SearchConfig]) -> str:
+    """The default of a key with a method, as text."""
+    field = (FIELDS | search_fields(settings))[key]
+    if row := {row.key: row for row in preset_rows(settings)}.get(key):
+        return " / ".join(dict.fromkeys((show(row.literature), show(row.uber))))
+    if key in LEFT_OPEN:
+        return show(LEFT_OPEN[key])
+    return "required" if field.is_required() else show(field.get_default(call_default_factory=True))

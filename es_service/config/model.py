@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, SerializeAsAny
@@ -388,6 +389,15 @@ class RunConfig(Section):
     def resolved_yaml(self) -> str:
         """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""
         return dump_yaml(self.model_dump(mode="json"))
+
+    def given_yaml(self, changes: Mapping[str, Any]) -> str:
+        """The text of a config file that gives what this config was given, with some values changed by dotted key. This
+        version makes the same config of it on this machine."""
+        sections: dict[str, Any] = {}
+        for key, value in {**self.made.given, **changes}.items():
+            *groups, leaf = key.split(".")
+            reduce(lambda section, group: section.setdefault(group, {}), groups, sections)[leaf] = value
+        return dump_yaml(sections)
 
     def constants(self) -> dict[str, Any]:
         """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""

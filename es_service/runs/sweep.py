@@ -159,11 +159,10 @@ def run_planned(
 
 
 def _given(run: PlannedRun, workers: int | Literal["auto"], inside: Path, options: Sequence[str]) -> _Command:
-    """The command of a run. Its config is resolved now, so that an edited file does not reach runs that start later."""
-    compute = run.config.compute.model_copy(update={"workers": workers})
+    """The command of a run. Its config is written now, so that an edited file does not reach runs that start later."""
     file = inside / f"{run.name}.yaml"
     try:
-        file.write_text(run.config.model_copy(update={"compute": compute}).resolved_yaml())
+        file.write_text(run.config.given_yaml({"compute.workers": workers}))
     except OSError as error:
         raise explained(error, inside, f"writing {file.name}", "start the sweep again") from error
     return run.name, bound("es_service", "run", str(file), "--or-resume", "--out", str(run.folder), *options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from dataclasses import replace
 
@@ -9,9 +10,12 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from es_service.cli.main import app
 from es_service.config.changes import changed_constants
 from es_service.config.keys import FIELDS, all_search_fields
+from es_service.config.loading import described_keys
 from es_service.config.resolution import default_chunk_pairs, default_gradient_block_pairs, default_rollout_block_pairs
 from es_service.config.search import PRESETS, preset_table, preset_values
 from es_service.config.text import dump_yaml, parse_value
@@ -239,6 +243,10 @@ def test_members_follow_from_the_algorithm():
 # Round trip and constants
 
 
+def overrides(values):
+    return [f"{name}={dump_yaml([value]).strip()[1:-1]}" for name, value in values.items()]
+
+
 POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
 
 
@@ -265,11 +273,15 @@ POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
     )
 )
 def test_resolved_yaml_loads_to_an_equal_config(values):
-    config = load(MINIMAL, *(f"{name}={dump_yaml([value]).strip()[1:-1]}" for name, value in values.items()))
+    config = load(MINIMAL, *overrides(values))
     again = load(parse_value(config.resolved_yaml()))
     assert again == config
     assert again.resolved_yaml() == config.resolved_yaml()
     assert changed_constants(config.constants(), again.constants()) == []
+    given = parse_value(config.given_yaml({"compute.workers": 2}))
+    assert isinstance(given, dict)
+    assert load(given) == load(MINIMAL, *overrides(values | {"compute.workers": 2}))
+    assert load(given).made.given.keys() == config.made.given.keys() | {"compute.workers"}
 
 
 @given(WORDS | st.floats(allow_nan=False) | st.integers() | st.booleans() | st.none() | st.lists(WORDS, max_size=3))
@@ -293,6 +305,26 @@ def test_worker_spec_says_what_the_config_says():
     assert spec.common_random_numbers is True
 
 
-def test_every_field_says_what_it_means():
-    for key, field in (FIELDS | all_search_fields(ALGORITHMS)).items():
-        assert field.description, key
+def test_every_key_is_described():
+    rows = {row.key: row for row in described_keys(OURS)}
+    assert rows.keys() == FIELDS.keys() | all_search_fields(OURS).keys() | {"task.options.NAME"}
+    assert all(row.meaning and row.allowed and row.default for row in rows.values())
+    assert rows["search.sigma"].default == "0.02; 0.05 with jedi; 0.025 with polish"
+    assert (rows["policy.init"].default, rows["map.cells"].default) == ("unit_columns / small_columns", "auto")
+    assert (rows["task.environment"].default, rows["search.batch"].methods) == ("required", ("map_elites",))
+    assert rows["map.qd_offset"].allowed == "auto or a number"
+
+
+def test_the_command_line_describes_the_keys_of_a_section_and_names_the_nearest_one():
+    def said(*words):
+        result = CliRunner().invoke(app, ["config", "--keys", *words], env={"COLUMNS": "200"})
+        return result.stdout if result.exit_code == 0 else result.exception
+
+    step = said("search.step")
+    assert [line.split(" = ")[0] for line in step.splitlines() if line[0] != " "] == [
+        f"search.step.{leaf}" for leaf in ("kind", "learning_rate", "l2", "max_speed", "momentum")
+    ]
+    assert "Must be a number, at least 0. A key of all but map_elites." in " ".join(step.split())
+    assert "\nseed = 0\n" in said()
+    assert json.loads(said("seed", "--json"))[0]["allowed"] == "a whole number, at least 0 and below 2**63"
+    assert str(said("search.sgima")) == "search.sgima: unknown key; did you mean search.sigma?"

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.config.keys import FIELDS, all_search_fields, methods_with, search_fields
-from es_service.config.resolution import LEFT_OPEN
+from es_service.config.keys import FIELDS, all_search_fields, methods_with
+from es_service.config.loading import described_keys
 from es_service.config.search import preset_table
 from es_service.config.text import show
 from es_service.search.algorithms import OURS
@@ -201,30 +201,14 @@ SOME_METHODS = {key: methods for key in KEYS if len(methods := methods_with(key,
 """Key that not every method has -> the methods that have it."""
 
 
-def defaults(key: str) -> list[str]:
-    """A key's default as the guide writes it, of each method that has the key."""
-    by_preset = {
-        row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table(OURS) if row.method is None
-    }
-    if key in by_preset:
-        return [by_preset[key]]
-    if key in LEFT_OPEN:
-        return [show(LEFT_OPEN[key])]
-    if KEYS[key].is_required():
-        return ["required"]
-    fields = [search_fields(method.settings) | FIELDS for method in OURS.values()]
-    return [show(of[key].get_default(call_default_factory=True)) for of in fields if key in of]
-
-
 def test_every_key_of_a_config_is_explained_with_its_default():
     tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
     shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
     assert len(shown) == len(dict(shown))
-    shown = dict(shown)
-    assert shown.pop("task.options.NAME") == "the task's"
-    assert shown.keys() == KEYS.keys()
-    for key, value in shown.items():
-        assert value in defaults(key), key
+    defaults = {row.key: row.default for row in described_keys(OURS)}
+    assert dict(shown).keys() == defaults.keys()
+    for key, value in shown:
+        assert value in (defaults[key], defaults[key].partition("; ")[0]), key
 
 
 def test_the_table_of_keys_of_methods_is_the_code_s():
