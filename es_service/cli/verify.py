@@ -12,11 +12,9 @@ from es_service.cli.console import console, print_line
 from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
 from es_service.errors import RunLockedError
-from es_service.runs.certification import Recomputed as RecomputedEpisodes
-from es_service.runs.certification import recomputed as recomputed_certifications
 from es_service.runs.checked_config import changed_config
 from es_service.runs.repeating import why_not_repeatable
-from es_service.runs.verification import Recomputed
+from es_service.runs.verification import Recomputed, RecomputedCertification, recomputed_certifications
 from es_service.runs.verification import verify as recompute
 
 
@@ -43,7 +41,7 @@ def verify(
         groups.append(group)
         if not as_json:
             print_line(console, _line(group))
-    certified: list[RecomputedEpisodes] = []
+    certified: list[RecomputedCertification] = []
     for one in recomputed_certifications(run, workers):
         certified.append(one)
         if not as_json:
@@ -84,7 +82,7 @@ def verify(
     raise typer.Exit(1 if differs and not why else 0 if is_judged else 3)
 
 
-def _certified_line(one: RecomputedEpisodes) -> str:
+def _certified_line(one: RecomputedCertification) -> str:
     kind = "decision" if one.policy.decides else "certification"
     where = "" if one.policy.elsewhere is None else f", also in {one.policy.elsewhere.title}"
     what = f"differs: {', '.join(one.differences)}" if one.differences else "equal"

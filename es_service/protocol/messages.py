@@ -142,6 +142,9 @@ class WorkerSpec:
     """How many numbers that descriptor has; 0 if it is the task's."""
     outputs: tuple[str, ...] = ()
     """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
+    keyed_resets: bool = False
+    """Whether environments of Gymnasium draw the starts of policies' episodes with the noise of the reset keys, so that
+    they are those of a task in JAX; no run does so."""
     parent_cache_bytes: int = 2**28
     """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
     output_bytes: int = 2**20

@@ -28,23 +28,20 @@ from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.runs.certified import (
     EPISODES,
     Certified,
     Elsewhere,
-    all_certifications,
-    arrays_of,
     measure_of,
     resets_of,
     stored,
 )
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
-from es_service.runs.identity import changes_since, code_of
-from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task, stored_task
-from es_service.runs.repeating import why_task_does_not_repeat
-from es_service.runs.selection import MEASURES, Episodes, Measure, Parameters, halved, kept, new_episodes, results_of
+from es_service.runs.identity import code_of
+from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
+from es_service.runs.selection import MEASURES, Measure, Parameters, halved, kept, results_of
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
@@ -54,19 +51,6 @@ OTHER_PROGRAMS = 2**40
 """Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
 TOP = 10
 """Default number of elites that are candidates beside the best centre."""
-
-
-@dataclass(frozen=True)
-class Recomputed:
-    """A stored certification or decision whose episodes were run again."""
-
-    policy: Certified
-    differences: tuple[str, ...]
-    """Names of the results that differ."""
-    changes: list[str]
-    """What has changed in packages, processor and code since it was made, in words."""
-    not_judged: str = ""
-    """Why nothing can be said of the episodes in another task; empty if it can, or if there are none."""
 
 
 @dataclass(frozen=True)
@@ -208,37 +192,6 @@ def certify(
     return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by)
 
 
-def recomputed(run: Run, workers: int | None = None) -> Iterator[Recomputed]:
-    """The stored certifications and decisions with what comes of their episodes on this machine now."""
-    certified = all_certifications(run.folder)
-    if not certified:
-        return
-    config = evaluation_config(run, workers)
-    with workers_for(config) as engine:
-        for policy in certified:
-            differences, other, why = _differences(engine, config, policy, policy.episodes), None, ""
-            if policy.elsewhere is not None:
-                task, there = policy.elsewhere.task, ()
-                try:
-                    other = stored_task(config, policy.elsewhere)
-                    with workers_for(other.config) as elsewhere:
-                        there = _differences(elsewhere, config, policy, policy.elsewhere.episodes)
-                    if there and (where := why_task_does_not_repeat(other.config)):
-                        why = f"{task} does not repeat itself: with the same seed it returns other numbers {where}"
-                except ConfigError as error:  # such as a package that is missing here
-                    why = f"the episodes in {task} cannot be run again: {error.sentence}"
-                differences += () if why else tuple(f"{name} in {task}" for name in there)
-            yield Recomputed(policy, differences, changes_since(policy.platform, platform_of(config, other)), why)
-
-
-def _differences(engine: Evaluator, config: RunConfig, policy: Certified, then: Episodes) -> tuple[str, ...]:
-    """Names of the results that differ from stored ones if the episodes of a certified policy are run again."""
-    seed, domain = policy.resets(config.seed)
-    [episodes] = new_episodes(engine, [policy.policy], then.count, seed, policy.number, 0, domain)
-    before, again = arrays_of(then), arrays_of(episodes)
-    return tuple(name for name in before if name not in again or before[name].tobytes() != again[name].tobytes())
-
-
 def _certify(
     config: RunConfig,
     given: Sequence[Named],
@@ -252,15 +205,20 @@ def _certify(
     """Select among candidates, then certify those that remain, in another task, too, if there is one."""
     measure, platform = _measure(config, by), platform_of(config, other)
     seed, domain = resets_of(config.seed, None if other is None else other.task.name)
-    with workers_for(config, on_compile, () if other is None else (FIRST_OBSERVATION,)) as engine:
+
+    def reported(engine: Evaluator) -> list[EpisodesResult]:
+        return results_of(engine, policies, episodes, seed, number, 0, domain)
+
+    with workers_for(config, on_compile) as engine:
         ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
         policies = [given[record.index].policy for record in ranked]
-        results = results_of(engine, policies, episodes, seed, number, 0, domain)
+        results = reported(engine) if other is None else []
     elsewhere: list[Elsewhere | None] = [None] * len(ranked)
     if other is not None:
-        with workers_for(other.config, on_compile, (FIRST_OBSERVATION,)) as engine:
-            there = results_of(engine, policies, episodes, seed, number, 0, domain)
-        elsewhere = [elsewhere_of(other, *pair) for pair in zip(results, there, strict=True)]
+        with workers_for(config, on_compile, compared=True) as engine:
+            results = reported(engine)
+        with workers_for(other.config, on_compile, compared=True) as engine:
+            elsewhere = [elsewhere_of(other, *pair) for pair in zip(results, reported(engine), strict=True)]
     certified = []
     for rank, (record, result) in enumerate(zip(ranked, results, strict=True)):
         candidate = given[record.index]
@@ -308,13 +266,19 @@ def different(chosen: Sequence[Candidate]) -> list[Named]:
 
 
 def workers_for(
-    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None, outputs: tuple[str, ...] = ()
+    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None, *, compared: bool = False
 ) -> AbstractContextManager[Evaluator]:
-    """Workers on this machine that give what certification keeps, and more outputs of episodes."""
+    """Workers on this machine that give what certification keeps.
+
+    Args:
+        compared: whether the episodes are compared with those of another task: then they begin as there as far as they
+            can, and have their first observations.
+    """
     task = task_of(config)
-    if task.parameters is not None:
-        outputs = ()  # a function has no observations
-    return workers_of(config, worker_spec(config, task, (*outputs_of(task), *outputs)), None, on_compile)
+    outputs = outputs_of(task)
+    if compared and task.parameters is None:
+        outputs = (*outputs, FIRST_OBSERVATION)
+    return workers_of(config, replace(worker_spec(config, task, outputs), keyed_resets=compared), None, on_compile)
 
 
 def outputs_of(task: TaskSpec) -> tuple[str, ...]:

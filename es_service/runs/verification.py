@@ -1,4 +1,5 @@
-"""Computing generations of a run again on this machine, from the states that the run keeps, and comparing the bits.
+"""Computing generations of a run again on this machine, from the states that the run keeps, and comparing the bits; and
+so the episodes of its certifications.
 
 Every generation has in its history the SHA-256 of its whole state, so a recomputed generation can be judged even if its
 state is not kept: a kept state is only needed as a beginning.
@@ -10,10 +11,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import NotInRunError, WayOut
+from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop import driver
 from es_service.loop.clock import Clock
 from es_service.loop.elites import Elites
@@ -23,8 +25,14 @@ from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
+from es_service.runs.certification import platform_of, workers_for
+from es_service.runs.certified import Certified, Elsewhere, all_certifications, arrays_of
 from es_service.runs.checked_config import changed_config
+from es_service.runs.evaluation import evaluation_config
 from es_service.runs.identity import changes_since, code_of
+from es_service.runs.other_task import stored_task
+from es_service.runs.repeating import why_task_does_not_repeat
+from es_service.runs.selection import Episodes, new_episodes
 from es_service.runs.session import dispatch_limits, initial_centres, initial_statistics
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run
@@ -36,6 +44,19 @@ from es_service.store.lock import require_unlocked
 from es_service.store.rows import HistoryRow as StoredRow
 from es_service.store.states import KeptRows, rows_in_force
 from es_service.store.tables import table_bytes
+
+
+@dataclass(frozen=True)
+class RecomputedCertification:
+    """A stored certification or decision whose episodes were run again."""
+
+    policy: Certified
+    differences: tuple[str, ...]
+    """Names of the results that differ."""
+    changes: list[str]
+    """What has changed in packages, processor and code since it was made, in words."""
+    not_judged: str = ""
+    """Why nothing can be said of the episodes in another task; empty if it can, or if there are none."""
 
 
 @dataclass(frozen=True)
@@ -198,3 +219,45 @@ def _state_differences(
     here = {part: sha256 for part, (_, sha256) in computed.items()}
     names = sorted({*at_generation, *(here if is_whole else ())})
     return [f"state/{name}" for name in names if here.get(name) != at_generation.get(name)]
+
+
+def recomputed_certifications(run: Run, workers: int | None = None) -> Iterator[RecomputedCertification]:
+    """The stored certifications and decisions with what comes of their episodes on this machine now; first those in the
+    run's task alone."""
+    certified = all_certifications(run.folder)
+    if not certified:
+        return
+    config = evaluation_config(run, workers)
+    if alone := [policy for policy in certified if policy.elsewhere is None]:
+        with workers_for(config) as engine:
+            for policy in alone:
+                changes = changes_since(policy.platform, platform_of(config))
+                yield RecomputedCertification(policy, _differing(engine, config, policy, policy.episodes), changes)
+    for policy in certified:
+        if policy.elsewhere is not None:
+            yield _recomputed_elsewhere(config, policy, policy.elsewhere)
+
+
+def _recomputed_elsewhere(config: RunConfig, policy: Certified, elsewhere: Elsewhere) -> RecomputedCertification:
+    """What comes of the episodes of a policy in the run's task and in another one."""
+    with workers_for(config, compared=True) as engine:
+        differences = _differing(engine, config, policy, policy.episodes)
+    task, other, there, why = elsewhere.task, None, (), ""
+    try:
+        other = stored_task(config, elsewhere)
+        with workers_for(other.config, compared=True) as engine:
+            there = _differing(engine, config, policy, elsewhere.episodes)
+        if there and (where := why_task_does_not_repeat(other.config)):
+            why = f"{task} does not repeat itself: with the same seed it returns other numbers {where}"
+    except ConfigError as error:  # such as a package that is missing here
+        why = f"the episodes in {task} cannot be run again: {error.sentence}"
+    differences += () if why else tuple(f"{name} in {task}" for name in there)
+    return RecomputedCertification(policy, differences, changes_since(policy.platform, platform_of(config, other)), why)
+
+
+def _differing(engine: Evaluator, config: RunConfig, policy: Certified, then: Episodes) -> tuple[str, ...]:
+    """Names of the results that differ from stored ones if the episodes of a certified policy are run again."""
+    seed, domain = policy.resets(config.seed)
+    [episodes] = new_episodes(engine, [policy.policy], then.count, seed, policy.number, 0, domain)
+    before, again = arrays_of(then), arrays_of(episodes)
+    return tuple(name for name in before if name not in again or before[name].tobytes() != again[name].tobytes())

@@ -26,6 +26,7 @@ from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, 
 from es_service.runs.certified import certified_policies
 from es_service.runs.evaluation import FRESH_GENERATION
 from es_service.runs.intervals import mean_interval, share_interval
+from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.store.writer import RunStore
 from tests.database import database, execute
@@ -169,14 +170,14 @@ def test_a_run_goes_on_with_its_certifications(finished, tmp_path):
 
 def test_the_same_episodes_again_have_the_same_bits(finished):
     run, _ = finished
-    found = list(certification.recomputed(run))
+    found = list(recomputed_certifications(run))
     assert [(one.differences, one.changes, one.not_judged) for one in found] == [((), [], "")] * 4
 
 
 def test_what_has_changed_since_is_named(finished, monkeypatch):
     run, _ = finished
     monkeypatch.setattr(certification, "platform_info", lambda: {**platform_info(), "numpy": "99.0"})
-    [first, *_] = certification.recomputed(run)
+    [first, *_] = recomputed_certifications(run)
     assert first.changes == [f"numpy {platform_info()['numpy']} -> 99.0"]
 
 
@@ -199,7 +200,7 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
         assert store.next_certification == 2, "its episodes have been seen"
     again = certify_run(tmp_path / "run", top=5, episodes=40)
     assert [one.number for one in again] == [2]
-    assert not any(one.differences for one in certification.recomputed(damaged))
+    assert not any(one.differences for one in recomputed_certifications(damaged))
 
 
 def test_another_policy_does_not_take_the_place_of_a_damaged_first(finished, tmp_path):

@@ -19,13 +19,15 @@ from es_service.loop.policies import policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, seed_for
-from es_service.runs import certification
+from es_service.report.facts import number
+from es_service.runs import certification, verification
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import all_certifications, certified_elsewhere, certified_policies
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.intervals import gap_interval, mean_interval, share_gap_interval
 from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
+from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.store.schema import get_meta, put_meta
 from es_service.watch.metrics import metrics
@@ -162,7 +164,8 @@ def test_every_reader_shows_the_other_tasks(copied, tmp_path):
     elsewhere = certified_elsewhere(copied.folder)
     assert {task: one.number for task, one in elsewhere.items()} == {"point_maze": 3, "point_maze (start = corner)": 1}
     corner = elsewhere["point_maze (start = corner)"].row()
-    gap = "gap {:+,.2f} [{:+,.2f}, {:+,.2f}]".format(*(corner[f"gap_return_{end}"] for end in ("mean", "low", "high")))
+    gap = "gap {} [{}, {}]".format(*(number(corner[f"gap_return_{end}"]) for end in ("mean", "low", "high")))
+    assert corner["gap_return_high"] < 0.0, "so none has a sign before it"
     status = runner.invoke(app, ["status", str(copied.folder)], catch_exceptions=False).stdout
     assert gap in status.split("in point_maze (start = corner)")[1]
     assert "with starts of their own in each task" in status
@@ -212,20 +215,20 @@ def test_nothing_is_stored_if_the_other_task_fails(of_python):
 
 def test_verify_names_what_differs_or_cannot_be_run_in_the_other_task(of_python, copied, monkeypatch):
     certify_run(copied.folder, top=0, episodes=16, **CORNER)
-    stored = certification.stored_task
-    monkeypatch.setattr(certification, "stored_task", lambda config, elsewhere: other_task(config, "point_maze"))
-    [found] = certification.recomputed(copied)
+    stored = verification.stored_task
+    monkeypatch.setattr(verification, "stored_task", lambda config, elsewhere: other_task(config, "point_maze"))
+    [found] = recomputed_certifications(copied)
     assert set(found.differences) >= {"return_E in point_maze", "descriptor_E_B in point_maze"}
     assert CliRunner().invoke(app, ["verify", str(copied.folder)]).exit_code == 1
 
     def missing(config, elsewhere):
         raise ConfigError("the package is missing")
 
-    monkeypatch.setattr(certification, "stored_task", missing)
+    monkeypatch.setattr(verification, "stored_task", missing)
     result = CliRunner().invoke(app, ["verify", str(copied.folder)])
     assert result.exit_code == 3
     assert "equal, but the episodes in point_maze cannot be run again: the package is missing" in result.stdout
-    monkeypatch.setattr(certification, "stored_task", stored)
+    monkeypatch.setattr(verification, "stored_task", stored)
     assert CliRunner().invoke(app, ["verify", str(copied.folder)]).exit_code == 0
 
 
@@ -296,3 +299,24 @@ def test_the_seed_for_a_name_is_no_other_one():
     seeds = {seed_for(seed, name) for seed in range(50) for name in ("point_maze", "ant_maze", "1\0point_maze")}
     assert len(seeds) == 150
     assert max(seeds) < 2**63
+
+
+@pytest.mark.long
+def test_a_policy_moves_between_mjx_and_c_mujoco_both_ways_with_the_same_starts(tmp_path):
+    names = ("mujoco:InvertedPendulum-v5", "gymnasium:InvertedPendulum-v5")
+    for here, there in (names, names[::-1]):
+        config = CONFIG | {"task": {"environment": here, "episode_steps": 60}, "map": {"enabled": False}}
+        config |= {"search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 2}, "budget": {"generations": 2}}
+        run = api.run(api.load_config(config), tmp_path / here.partition(":")[0], progress=False).run
+        said: list[str] = []
+        [found] = certify_run(run.folder, episodes=32, task=there, on_notice=said.append)
+        assert f"{there} does not tell the descriptor" in said[0]
+        assert found.elsewhere is not None
+        assert found.elsewhere.paired
+        assert np.ptp(found.episodes.return_E) > 0.0
+        np.testing.assert_allclose(found.elsewhere.episodes.return_E, found.episodes.return_E, atol=1.0)
+        assert abs(found.row()["gap_return_mean"]) < 0.2
+        [again] = recomputed_certifications(run)
+        assert (again.differences, again.changes, again.not_judged) == ((), [], "")
+        [replay] = record(run, best=False, cells=[], certified=True)[0]
+        assert replay.is_the_stored

@@ -18,7 +18,14 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
-from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
+from es_service.protocol.noise import (
+    NORMAL_STD,
+    Domain,
+    evaluation_reset_keys,
+    normal_integers,
+    stream_keys,
+    uniforms,
+)
 from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.replay import record
@@ -32,6 +39,7 @@ from workers.host.episodes import Lanes
 from workers.host.examine import examine
 from workers.host.policies import LanePolicies
 from workers.host.repeats import does_not_repeat
+from workers.host.seeds import KeyedGenerator
 from workers.worker import make_worker
 
 MODULE = "tests.workers.host_tasks"
@@ -49,6 +57,21 @@ def config_of(environment, search=ES, **compute):
         "budget": {"generations": 4},
         "compute": {"engine": "inline", "workers": 2} | compute,
     }
+
+
+def test_a_generator_draws_the_variates_of_its_key_one_after_another():
+    key = stream_keys(1, Domain.OTHER_TASK_RESET, 2, 3)
+    drawn, at = KeyedGenerator(key), np.arange(20, dtype=np.uint32)
+    u, z = uniforms(key, at).astype(float), normal_integers(np, key, at) / NORMAL_STD
+    np.testing.assert_array_equal(drawn.uniform(-1.0, 1.0, size=3), 2.0 * u[:3] - 1.0)
+    assert drawn.uniform(2.0, 4.0) == 2.0 + 2.0 * u[3]
+    np.testing.assert_array_equal(drawn.standard_normal((2, 2)), z[4:8].reshape(2, 2))
+    np.testing.assert_array_equal(drawn.normal([1.0, 2.0], 0.5), [1.0, 2.0] + 0.5 * z[8:10])
+    np.testing.assert_array_equal(drawn.uniform(low=[0.0, 1.0, 2.0], high=3.0), u[10:13] * [3, 2, 1] + [0, 1, 2])
+    assert drawn.random() == u[13]
+    assert drawn.normal() == z[14]
+    others = [(one.integers(1000), one.random(2, np.float32).tolist()) for one in (KeyedGenerator(key), drawn)]
+    assert others[0] == others[1], "they depend on the key alone"
 
 
 @pytest.mark.slow

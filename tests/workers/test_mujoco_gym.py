@@ -17,7 +17,7 @@ import pytest
 from es_service.protocol.messages import with_options
 from es_service.protocol.noise import Domain, stream_keys
 from tests.mujoco_models import relative_error
-from workers.environments import TaskError, describe_environment, make_environment, mujoco_gym
+from workers.environments import TaskError, describe_environment, make_environment, make_host_task, mujoco_gym
 from workers.environments.mujoco_gym_tasks import REFUSED, TASKS
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.graph.unsupported import UnsupportedError
@@ -50,6 +50,23 @@ def random_states(name: str, count: int) -> list[np.ndarray]:
             environment.step(rng.uniform(space.low, space.high))
         rows.append((environment.data.qpos.copy(), environment.data.qvel.copy(), rng.uniform(-1, 1, space.shape)))
     return [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("name", sorted({*TASKS} - {"Reacher-v5"}))
+def test_gymnasium_begins_as_mjx_if_it_draws_from_the_noise_of_the_key(name):
+    """Reacher draws the place of its goal until it is near enough, and the task does not."""
+    task, start = make_host_task(f"gymnasium:{name}", {}), mujoco_gym.build(name).parts.start
+    made = task.make()
+    assert task.reset_by_key is not None
+    for key in KEYS[:3]:
+        observation, _ = task.reset_by_key(made, key)
+        qpos, qvel = start(key)
+        np.testing.assert_allclose(made.data.qpos, qpos, atol=1e-6)
+        np.testing.assert_allclose(made.data.qvel, qvel, atol=1e-6)
+        again, _ = task.reset_by_key(made, key)
+        np.testing.assert_array_equal(again, observation)
+    seeded, _ = made.reset(seed=7)
+    np.testing.assert_array_equal(seeded, task.make().reset(seed=7)[0], err_msg="a seed is what it was")
 
 
 def steps_of_gymnasium(name: str, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray) -> tuple[Steps, np.ndarray]:

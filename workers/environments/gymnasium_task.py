@@ -45,6 +45,7 @@ from workers.environments.host_task import (
     try_out,
     within_bounds,
 )
+from workers.host.seeds import KeyedGenerator, seed_of
 
 EPISODE_STEPS = 1000
 """Default length of an episode where the environment has no limit."""
@@ -121,7 +122,18 @@ def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
         descriptor_size=1,
         descriptor=length,
         success=said_success,
+        reset_by_key=_reset_by_key,
     )
+
+
+def _reset_by_key(environment: Any, key: Any) -> Any:
+    """Begin an episode whose start the environment draws from the noise of a stream key.
+
+    The first reset seeds whatever the environment has besides Gymnasium's generator, which the second one uses.
+    """
+    environment.reset(seed=seed_of(key))
+    environment.unwrapped.np_random = KeyedGenerator(key)
+    return environment.reset()
 
 
 def _refused(task: str, what: str, options: Mapping[str, OptionValue], error: BaseException) -> TaskError:

@@ -71,6 +71,9 @@ class HostTask:
     """Function from an episode that ends now to whether it has succeeded."""
     goal_distance: Callable[[HostEpisode], Any] | None = None
     """Function from an episode to the present distance to the goal; None if there is no goal."""
+    reset_by_key: Callable[[Any, NDArray[np.uint32]], Any] | None = None
+    """Function (object, stream key) that begins an episode and returns what `reset` returns, with the noise of the key
+    as far as the object can draw it; None if it takes nothing but a seed."""
     keeps_all: bool = False
     """Whether `HostEpisode` has all observations and rewards."""
 
@@ -98,9 +101,16 @@ class HostEnvironment:
         self.first_observation_O = self._episode.observation_O
         """Observation [O] with which the present episode began."""
 
-    def reset(self, seed: int) -> FloatArray:
-        """Start an episode, and return its first observation [O]."""
-        result = self._object.reset(seed=seed)
+    def reset(self, seed: int, key: NDArray[np.uint32] | None = None) -> FloatArray:
+        """Start an episode, and return its first observation [O].
+
+        Args:
+            key: stream key with whose noise the object draws the start if it can; None: with the seed alone.
+        """
+        if key is None or self._task.reset_by_key is None:
+            result = self._object.reset(seed=seed)
+        else:
+            result = self._task.reset_by_key(self._object, key)
         observation, info = result if _is_pair(result) else (result, {})
         self._require_info("reset", info)
         self._episode = HostEpisode(self._object, self._observed("reset", observation), info, dict(info))

@@ -59,6 +59,7 @@ def run_episodes(
     *,
     runs_L: NDArray[np.bool_] | None = None,
     watched: Watched | None = None,
+    keyed: bool = False,
 ) -> Episodes:
     """One episode in each lane, all of a policy of its own.
 
@@ -71,6 +72,7 @@ def run_episodes(
             by `mean`; None for evaluations, which have traces.
         runs_L: which lanes run; None for all. The results of the others are 0.
         watched: filled with the episode of one lane.
+        keyed: whether the environments draw their starts with the noise of their reset keys, as far as they can.
 
     Returns:
         Episodes with leading axis [L].
@@ -102,7 +104,8 @@ def run_episodes(
     lane = step = 0
     try:
         for lane, environment in progress.counted("resetting", running):
-            observation_L_O[lane] = environment.reset(seed_of(reset_keys_L_4[lane]))
+            key_4 = reset_keys_L_4[lane]
+            observation_L_O[lane] = environment.reset(seed_of(key_4), key_4 if keyed else None)
             if not training:
                 trace_L_T_B[lane] = environment.descriptor()
             watch(lane, environment)

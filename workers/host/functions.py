@@ -39,12 +39,14 @@ def run_calls(
     *,
     runs_L: NDArray[np.bool_] | None = None,
     watched: Watched | None = None,
+    keyed: bool = False,
 ) -> Episodes:
     """One call for each lane that runs, in their order.
 
     Args:
         called: calls the task, here or in another process.
-        others: those of `workers.host.episodes.run_episodes`. Keys of the noise only tell training from evaluation.
+        others: those of `workers.host.episodes.run_episodes`. Keys of the noise only tell training from evaluation, and
+            a call takes a seed in any case.
 
     A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr,
     unless it says by -inf that a point is infeasible, and that is allowed.

@@ -59,7 +59,7 @@ class Host(RolloutBackend):
             return run(_in_lanes(centre_D, len(reset_keys_E)), mean_O, std_O, reset_keys_E, runs_L=wanted_E)
 
         def policies(given, mean_L_O, std_L_O, policy_L, reset_keys_L):
-            return run(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L)
+            return run(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L, keyed=spec.keyed_resets)
 
         return ChunkFunctions(
             Compilable(training, lambda *given: prepare(range(2 * len(given[4])))),
@@ -145,6 +145,7 @@ def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recordin
         _in_lanes(key, count),
         runs_L=np.arange(count) == slot,
         watched=watched,
+        keyed=request.domain == Domain.OTHER_TASK_RESET,
     )
     descriptor_T_B = np.stack(watched.descriptors)
     known_from_the_start(descriptor_T_B)

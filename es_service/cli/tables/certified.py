@@ -9,6 +9,7 @@ from rich.console import Console
 
 from es_service.cli.console import print_line
 from es_service.errors import counted
+from es_service.report.facts import number
 from es_service.runs.certified import Certified, pairs_sentence, tries_sentence
 
 
@@ -54,8 +55,12 @@ def _values(row: Mapping[str, Any], prefix: str = "") -> list[str]:
 def _gap(row: Mapping[str, Any], name: str, prefix: str, scale: float = 1.0, unit: str = "") -> str:
     if not prefix or row[f"gap_{name}_mean"] is None:
         return ""
-    mean, low, high = (scale * row[f"gap_{name}_{end}"] for end in ("mean", "low", "high"))
-    return f" (gap {mean:+,.2f} [{low:+,.2f}, {high:+,.2f}]{unit})"
+    mean, low, high = (_signed(scale * row[f"gap_{name}_{end}"]) for end in ("mean", "low", "high"))
+    return f" (gap {mean} [{low}, {high}]{unit})"
+
+
+def _signed(value: float) -> str:
+    return f"{'+' if value >= 0.0 else ''}{number(value)}"
 
 
 def _interval(row: Mapping[str, Any], name: str) -> str:
