@@ -18,7 +18,8 @@ class _State(NamedTuple):
 
 
 class Drawn:
-    """the step draws noise with a key of JAX, and the state has arrays of several sizes; the episode ends at random"""
+    """the step has Fourier transforms, and the state arrays of several sizes and a key of JAX that draws noise; the
+    episode ends at random"""
 
     observation_size, action_size, episode_steps = 3, 3, 20
     descriptor_names, descriptor_bounds = ("x", "y"), ((-2.0, 2.0), (-2.0, 2.0))
@@ -32,7 +33,8 @@ class Drawn:
 
     def step(self, state: _State, action: Any) -> tuple[_State, Any, Any]:
         key, mine = jax.random.split(state.key)
-        place = jnp.clip(jnp.sort(state.place + 0.1 * action + 0.1 * jax.random.normal(mine, (3,))), -2.0, 2.0)
+        moved = there_and_back(state.place + 0.1 * action + 0.1 * jax.random.normal(mine, (3,)))
+        place = jnp.clip(jnp.sort(moved), -2.0, 2.0)
         after = _State(place, key, state.counter + jnp.uint8(100), place[2] > 1.0)
         return after, place[0] + state.counter.astype(jnp.float32).sum(), jax.random.bernoulli(key, 0.1)
 

@@ -107,6 +107,9 @@ class Environment:
     in this state; always False if the task does not declare success."""
     viewer: Viewer | None = None
     """Data for replays in three dimensions; None if the task has no bodies."""
+    compiles_drawn_resets: bool = False
+    """Whether simd may compile a reset that draws by `jax.random`. JAX computes it if not, as it always has for Brax's
+    environments and for tasks of users, so that their runs keep their bits."""
 
 
 def make_environment(name: str, options: Mapping[str, Any]) -> Environment:

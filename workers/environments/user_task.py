@@ -62,6 +62,7 @@ from workers.environments.declared import (
     unknown_attributes,
     wrong_values,
 )
+from workers.environments.keys import words_in_place_of_keys
 
 METHODS = ("reset", "observe", "step", "descriptor")
 ATTRIBUTES = {
@@ -206,7 +207,9 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
 
     viewer = task.viewer() if hasattr(task, "viewer") else None
     success = getattr(task, "success", lambda state, before: before)
-    return Environment(reset, observe, step, task.descriptor, goal_distance, success, viewer)
+    return words_in_place_of_keys(
+        Environment(reset, observe, step, task.descriptor, goal_distance, success, viewer=viewer)
+    )
 
 
 def _wants_jax_key(error: Exception) -> bool:

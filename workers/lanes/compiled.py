@@ -108,7 +108,8 @@ def compiled_resets(begin: Kernel) -> Resets:
 @functools.cache
 def kernels(name: str, options: tuple[tuple[str, OptionValue], ...], actions: int) -> Kernels:
     """The compiled reset and the compiled step of a task, as far as simd can compile them on this machine."""
-    begin, step = lane_functions(make_environment(name, dict(options)))
+    environment = make_environment(name, dict(options))
+    begin, step = lane_functions(environment)
 
     def resets_to_check(begun: Kernel | None) -> NDArray[np.uint32]:
         lane_L, keys_L = np.arange(LANES), reset_keys()
@@ -123,10 +124,11 @@ def kernels(name: str, options: tuple[tuple[str, OptionValue], ...], actions: in
         check_kernel(kernel, graph, outputs, given_L, f"a step of {name}")
 
     begun, lacks = None, ""
-    with jax.enable_x64(False):  # the caller may have another mode, but bits must not depend on it
+    with jax.enable_x64(False), jax.threefry_partitionable(True):  # bits must not depend on the caller's modes
         key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
         try:
-            begun = compile_kernel(begin, key, check=functools.partial(check_resets, environment=name))
+            check, may_draw = functools.partial(check_resets, environment=name), environment.compiles_drawn_resets
+            begun = compile_kernel(begin, key, check=check, may_draw=may_draw)
         except UnsupportedError as error:
             lacks = f"its reset: {error}"
         except NoVectorsError as error:

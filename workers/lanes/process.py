@@ -28,30 +28,16 @@ class BlockLanes:
     def __init__(self, name: str, options: Mapping[str, OptionValue], lanes: int, first: int) -> None:
         """Compile the reset. Arguments are those of `workers.lanes.blocks.Blocks`."""
         begin, step = lane_functions(make_environment(name, options))
-        kinds: list[Any] = []
-        """Of each leaf of a carry, the kind of key of JAX that it is; None for other arrays."""
-
-        def carry(key: Any) -> Any:
-            carry, _ = begin(key)
-            kinds[:] = [jax.random.key_impl(leaf) if _is_key(leaf) else None for leaf in jax.tree.leaves(carry)]
-            return carry
-
-        tree = jax.tree.structure(jax.eval_shape(carry, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)))
-
-        def arrays_of(carry: Any) -> list[Any]:
-            return [jax.random.key_data(leaf) if _is_key(leaf) else leaf for leaf in jax.tree.leaves(carry)]
+        key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+        tree = jax.tree.structure(jax.eval_shape(lambda key: begin(key)[0], key))
 
         def begun(key: Any) -> tuple[list[Any], Seen]:
             carry, seen = begin(key)
-            return arrays_of(carry), seen
+            return jax.tree.leaves(carry), seen
 
         def stepped(arrays: Sequence[Any], action_A: Any) -> tuple[list[Any], Seen]:
-            leaves = [
-                array if kind is None else jax.random.wrap_key_data(array, impl=kind)
-                for array, kind in zip(arrays, kinds, strict=True)
-            ]
-            carry, seen = step(jax.tree.unflatten(tree, leaves), action_A)
-            return arrays_of(carry), seen
+            carry, seen = step(jax.tree.unflatten(tree, arrays), action_A)
+            return jax.tree.leaves(carry), seen
 
         self._begin, self._step = jax.jit(jax.vmap(begun)), jax.jit(jax.vmap(stepped))
         self._first, self._places = first, np.arange(first, first + lanes)
@@ -108,10 +94,6 @@ def _as_words(array_M: NDArray) -> NDArray[np.uint32]:
     """The bits of an array [M, ...] as words [M, words], one for each number of less than 32 bits, as in simd."""
     rows = np.ascontiguousarray(array_M).reshape(len(array_M), -1)
     return rows.view(np.uint32) if rows.itemsize >= 4 else rows.view(f"u{rows.itemsize}").astype(np.uint32)
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _lanes(name: str, *given: Any) -> Any:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 from jax import lax
+from jax.extend.random import threefry_prng_impl
 
 from tests.workers.simd import index_cases
 from tests.workers.simd.draws import Case, Draw, booleans, floats, integers, shape, special
@@ -290,6 +291,102 @@ def triangular_solve(draw: Draw) -> Case:
     ), [matrices, right]  # fmt: skip
 
 
+NARROW = ("int8", "uint8", "int16", "uint16")
+
+
+def narrow(draw: Draw) -> Case:
+    """Integers of 8 and 16 bits, which wrap around in their own range."""
+    dtype, of = draw(st.sampled_from(NARROW)), shape(draw, least=1, most=2)
+    axis = draw(st.integers(0, len(of) - 1))
+
+    def arithmetic(a, b):
+        return (
+            a + b, a - b, a * b, -a, abs(a), lax.square(a), lax.integer_pow(a, 3), ~a, a ^ b, lax.div(a, b),
+            lax.rem(a, b),
+        )  # fmt: skip
+
+    def along_axes(a, b):
+        return (
+            a.sum(axis), a.prod(axis), jnp.cumsum(a, axis), lax.cummax(a, axis), jnp.argmax(a, axis), jnp.sort(a, axis),
+            jnp.zeros(5, a.dtype).at[(b.reshape(-1) % 5).astype(jnp.int32)].add(a.reshape(-1)),
+        )  # fmt: skip
+
+    def others(a, b):
+        by = b & 7
+        return (
+            a < b, a <= b, a == b, lax.max(a, b), jnp.sign(a), a.astype(jnp.float32),
+            jnp.bitwise_count(a) + jnp.uint8(255), lax.clz(a), a << by, a >> by, lax.shift_right_logical(a, by),
+            *(a.astype(one) for one in (*NARROW, "int32", bool)),
+            lax.bitcast_convert_type(a, f"int{8 * a.dtype.itemsize}"),
+        )  # fmt: skip
+
+    return draw(st.sampled_from([arithmetic, along_axes, others])), [integers(draw, of).astype(dtype) for _ in range(2)]
+
+
+def shifts(draw: Draw) -> Case:
+    dtype = draw(st.sampled_from(["int32", "uint32"]))
+    by = integers(draw, (3,), dtype)
+    return lambda a, b: (
+        lax.shift_left(a, b), lax.shift_right_logical(a, b), lax.shift_right_arithmetic(a, b), lax.clz(a), a >> 32,
+        a << 32,
+    ), [integers(draw, (3,), dtype), np.where(by % 3 == 0, by, by % 40)]  # fmt: skip
+
+
+def orders(draw: Draw) -> Case:
+    make = draw(st.sampled_from(ORDERED[:3]))
+    return lambda a, b: (
+        jnp.searchsorted(jnp.sort(a), b), lax.le_to_p.bind(a, b), lax.lt_to_p.bind(a, b)
+    ), [make(draw, (5,)), make(draw, (5,))]  # fmt: skip
+
+
+def keys_of_jax(draw: Draw) -> Case:
+    """Typed keys, which are moved, chosen and carried by loops as other values are, and raw ones."""
+    seed = draw(st.integers(0, 9))
+
+    def made(words, number, which):
+        keys = jax.random.split(jax.random.wrap_key_data(words), (2, 2))
+        chosen = jnp.where(which, keys[1, 1], jax.random.fold_in(keys[0, 0], number))
+        batch = jax.vmap(jax.random.fold_in, (0, None))(keys.reshape(-1), number)
+        seeded = jax.random.key(number), jax.random.key(seed)
+        return [jax.random.key_data(one) for one in (keys.T[1:], chosen, jnp.roll(keys, 1, 0), batch, *seeded)]
+
+    def carried(words, number, which):
+        scanned, _ = lax.scan(lambda key, _: (jax.random.split(key)[1], None), words, None, length=2)
+        ended = lax.while_loop(
+            lambda c: c[0] < number % 5, lambda c: (c[0] + 1, jax.random.fold_in(c[1], 3)), (0, jax.random.key(7))
+        )
+        return scanned, jax.random.key_data(ended[1]), ended[0]
+
+    return draw(st.sampled_from([made, carried])), [
+        integers(draw, (2,), "uint32"), integers(draw, ()), booleans(draw, ())
+    ]  # fmt: skip
+
+
+def draws_of_jax(draw: Draw) -> Case:
+    """Bits are JAX's, and those of uniform numbers too."""
+    of = shape(draw, most=2)
+
+    def bits(words):
+        drawn = [jax.random.bits(words, of, dtype) for dtype in (jnp.uint16, jnp.uint8)]
+        return drawn, jax.random.bernoulli(words, 0.3, of)
+
+    def uniform(words):
+        drawn = jax.random.uniform(words, of), jax.random.uniform(words, (3,), minval=-0.05, maxval=0.3)
+        return [lax.bitcast_convert_type(x, jnp.int32) for x in drawn]
+
+    def whole(words):
+        return jax.random.randint(words, of, -3, 9), jax.random.permutation(words, 4)
+
+    one = draw(st.sampled_from([bits, uniform, whole]))
+    return lambda words: (threefry_prng_impl.random_bits(words, 32, (2,)), one(words)), [integers(draw, (2,), "uint32")]
+
+
+def normals_of_jax(draw: Draw) -> Case:
+    return lambda key: (jax.random.normal(key, (4,)), jax.random.categorical(key, jnp.arange(3.0))), [
+        integers(draw, (2,), "uint32")
+    ]
+
+
 CASES: dict[str, Callable[[Draw], Case]] = {
     "add": binary(jnp.add),
     "integer arithmetic": binary(lambda a, b: (a + b, a - b, a * b, -a, jnp.abs(a), lax.square(a)), integers),
@@ -378,4 +475,10 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "triangular solve": triangular_solve,
     "solves of trees": solves_of_trees,
     "bits": bits,
+    "narrow integers": narrow,
+    "shifts": shifts,
+    "orders": orders,
+    "keys of JAX": keys_of_jax,
+    "draws of JAX": draws_of_jax,
+    "normals of JAX": normals_of_jax,
 }

@@ -129,6 +129,7 @@ EDGES: list[tuple[Callable, list[float], list[float]]] = [
     (jnp.arcsin, [1.5, -1.5, NAN, 1.0, 0.0], [NAN, NAN, NAN, math.pi / 2, 0.0]),
     (jnp.arccos, [1.5, -1.5, NAN, 1.0, -1.0, 0.0], [NAN, NAN, NAN, 0.0, math.pi, math.pi / 2]),
     (jnp.arctan, [INF, -INF, NAN, 0.0], [math.pi / 2, -math.pi / 2, NAN, 0.0]),
+    (jax.lax.erf_inv, [1.0, -1.0, 1.5, -INF, NAN, 0.0, -0.0], [INF, -INF, NAN, NAN, NAN, 0.0, -0.0]),
     (jnp.sqrt, [-1.0, 0.0, INF, NAN, 1e-40], [NAN, 0.0, INF, NAN, 0.0]),
 ]
 
@@ -144,3 +145,17 @@ def test_conversion_to_integers_is_jaxs() -> None:
     x = np.array([0.0, -0.0, 1.9, -1.9, 2e9, 3e9, -3e9, INF, -INF, NAN, 2147483520.0], np.float32)
     found = compiled(lambda x: x.astype(jnp.int32))(x)
     np.testing.assert_array_equal(found, np.asarray(jnp.asarray(x).astype(jnp.int32)))
+
+
+def test_the_inverse_of_erf_and_so_normal_numbers_are_within_2_ulp_of_jaxs() -> None:
+    """Their distance from the exact value is greater near -1 and 1, where 1 - x^2 is rounded."""
+    x = np.concatenate([spread(-1.0, 1.0), 1.0 - np.exp(spread(-17.0, -1.0))]).astype(np.float32)
+    x = x[np.abs(x) < 1.0]
+    found, wanted = (np.asarray(f(x)) for f in (compiled(jax.lax.erf_inv), jax.jit(jax.lax.erf_inv)))
+    assert ulps(found, wanted.astype(np.float64)).max() <= 2.0
+    keys = np.random.default_rng(3).integers(0, 2**32, (2000, 2), dtype=np.uint32)
+    normal = lambda key: jax.random.normal(key, (50,))  # noqa: E731
+    found = compile_kernel(normal, jax.ShapeDtypeStruct((2,), jnp.uint32))(keys)
+    wanted = np.asarray(jax.jit(jax.vmap(normal))(keys))
+    assert ulps(found, wanted.astype(np.float64)).max() <= 2.0
+    assert (found == wanted).mean() > 0.999

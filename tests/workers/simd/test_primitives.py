@@ -89,7 +89,7 @@ def test_every_primitive_has_a_case() -> None:
         ),
         (lambda x: jnp.sort(jnp.tile(x, 300)), r"sort of 900 numbers, by 20,958 comparisons \(at most 20,000\)"),
         (lambda x: x.astype(jnp.float16).astype(jnp.float32), "values of type float16"),
-        (lambda x: (x.astype(jnp.int32).astype(jnp.uint8) + 1).astype(jnp.float32), "add of uint8"),
+        (lambda x: jax.random.uniform(jax.random.key(0, impl="rbg"), x.shape), "values of type key<rbg>"),
         (
             lambda x: lax.while_loop(lambda c: c[0] < 10**6, lambda c: (c[0] + 1, c[1]), (0, x))[1],
             "a while loop of more",

@@ -12,7 +12,7 @@ import pytest
 
 import workers.simd.episodes.program
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
-from es_service.protocol.noise import Domain, normal_integers, stream_keys, uniforms
+from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.backend import emit
@@ -72,14 +72,6 @@ class Walk:
         return state["x"]
 
 
-def _jax_random(state: Any, action: Any) -> Any:
-    return jax.random.normal(jax.random.fold_in(jax.random.wrap_key_data(state["key"][:2]), state["count"]), (2,))
-
-
-def _uniforms(state: Any, action: Any) -> Any:
-    return uniforms(state["key"], 2 * state["count"] + jnp.arange(2, dtype=jnp.uint32))
-
-
 def _chosen(array: Any, index: Any) -> Any:
     return jax.nn.one_hot(index, len(array)) @ array
 
@@ -103,7 +95,6 @@ def _system(state: Any) -> Any:
 @pytest.mark.parametrize(
     ("move", "advice", "instead"),
     [
-        (_jax_random, "es_service.protocol.noise.uniforms(key, counters)", _uniforms),
         (
             lambda s, a: TABLE[_index(s)],
             "jax.nn.one_hot(index, len(array)) @ array",
@@ -135,18 +126,18 @@ def test_a_refusal_says_what_the_task_can_do_instead_and_then_it_is_compiled(
     assert advice in why.partition("; ")[2]
     monkeypatch.setattr(Walk, "move", staticmethod(instead))
     assert rollout.why_not(describe_environment(f"{__name__}:Walk")) == ""
-    if move is not _jax_random:  # which draws other numbers
-        state = Walk().reset(jnp.zeros(4, jnp.uint32)) | {"x": jnp.array([0.25, -0.5])}
-        action = jnp.array([0.1, 0.7, -0.3, 0.2])
-        np.testing.assert_allclose(instead(state, action), move(state, action), rtol=1e-6)
+    state = Walk().reset(jnp.zeros(4, jnp.uint32)) | {"x": jnp.array([0.25, -0.5])}
+    action = jnp.array([0.1, 0.7, -0.3, 0.2])
+    np.testing.assert_allclose(instead(state, action), move(state, action), rtol=1e-6)
 
 
-def test_a_key_of_jax_in_the_state_is_refused_with_what_to_use_instead(monkeypatch: pytest.MonkeyPatch):
+def test_keys_of_another_generator_than_threefry_are_refused_with_what_to_use_instead(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(
-        Walk, "reset", lambda self, key: {"x": jnp.zeros(2), "key": jax.random.wrap_key_data(key[:2]), "count": 0}
+        Walk, "move", lambda self, state, action: jax.random.uniform(jax.random.key(1, impl="rbg"), (2,)) + action[:2]
     )
     why = rollout.why_not(describe_environment(f"{__name__}:Walk"))
-    assert why.startswith("values of type key<fry>: simd supports float32, int32, uint32 and bool; make random numbers")
+    assert why.startswith("values of type key<rbg>: simd supports float32, integers of 8, 16 and 32 bits, bool and ")
+    assert "; draw by JAX's own generator, threefry2x32, or by es_service.protocol.noise.uniforms" in why
 
 
 class Heat:

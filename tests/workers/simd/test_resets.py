@@ -51,6 +51,25 @@ class Keyed(Drift):
         return super().reset(key) + jax.random.uniform(self.layout, (2,))
 
 
+class Drawing(Drift):
+    """its state has a key of JAX, with which its steps draw"""
+
+    def reset(self, key: Any) -> Any:
+        return super().reset(key), jax.random.wrap_key_data(key[:2]), jnp.int8(100)
+
+    def observe(self, state: Any) -> Any:
+        return state[0]
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        place, key, count = state
+        key, here = jax.random.split(key)
+        place, reward, _ = super().step(place + 0.1 * jax.random.normal(here, (2,)), action)
+        return (place, key, count + jnp.int8(50)), reward + count, jax.random.bernoulli(key, 0.05)
+
+    def descriptor(self, state: Any) -> Any:
+        return state[0]
+
+
 class Watched(Drift):
     """its reset calls Python, by an address that no other process has"""
 
@@ -61,8 +80,8 @@ class Watched(Drift):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [Drift, Keyed, Watched])
-def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
+@pytest.mark.parametrize("task", [Drift, Keyed, Watched, Drawing])
+def test_a_reset_that_the_compiler_chokes_on_is_jaxs_and_steps_may_draw_by_jax(task: type) -> None:
     name = f"{__name__}:{task.__name__}"
     assert rollout.why_not(describe_environment(name)) == ""
     worker_spec = spec(environment=name, policy=PolicySpec((2, 8, 2)), episode_steps=10)
@@ -74,6 +93,18 @@ def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
         ours, theirs = simd(point, chunk), xla(point, chunk)
         np.testing.assert_allclose(ours.returns, theirs.returns, rtol=1e-4)
         np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=1e-4)
+
+
+@pytest.mark.parametrize("may_draw", [False, True])
+def test_a_reset_that_draws_is_compiled_only_if_its_task_says_so(may_draw: bool) -> None:
+    """JAX's normal numbers and simd's differ in a few bits of a thousand, and runs of older versions have JAX's."""
+    keys_L = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(4000))
+    draw = lambda key: jax.random.normal(key[:2], (50,))  # noqa: E731
+    resets = compile_resets(draw, host_target(), None, 4000, may_draw=may_draw)
+    words = unpack(resets(keys_L), [jax.ShapeDtypeStruct((50,), jnp.float32)], 4000)[0]
+    of_jax = np.asarray(jax.jit(jax.vmap(draw))(keys_L))
+    assert (words != of_jax).any() == may_draw
+    np.testing.assert_allclose(words, of_jax, rtol=3e-7)
 
 
 def test_what_a_rule_did_not_foresee_is_refused_by_name_and_place(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -227,7 +227,9 @@ def compile_episodes(
     kind = {"training": training, "per_lane_weights": per_lane_weights, "finds_faults": finds_faults}
     program = write_episodes(environment, spec, inputs_O, target, **kind)
     lanes = 2 * spec.chunk_pairs if training else EVALUATION_EPISODES_PER_CHUNK
-    begin = compile_resets(program.steps.begin, target, folder, lanes, check_resets)
+    begin = compile_resets(
+        program.steps.begin, target, folder, lanes, check_resets, may_draw=environment.compiles_drawn_resets
+    )
     episode = program.carry.episode
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 

@@ -20,10 +20,12 @@ from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, require, unpack, words_of
 from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.frontend.trace import draws, trace_jaxpr
 from workers.simd.graph.graph import Graph, live
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.unsupported import UnsupportedError
+
+DRAWN = "random numbers of JAX in a reset, which JAX draws itself"
 
 
 class Facts(NamedTuple):
@@ -110,6 +112,7 @@ def compile_kernel(
     target: Target | None = None,
     folder: Path | None = None,
     check: Check = no_check,
+    may_draw: bool = True,
 ) -> Kernel:
     """Compile a pure JAX function of one environment.
 
@@ -119,6 +122,7 @@ def compile_kernel(
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
         check: check of new code, which is not kept if it is wrong; see check.py.
+        may_draw: whether random numbers of JAX are compiled.
 
     Raises:
         UnsupportedError: the function contains something that cannot be compiled.
@@ -128,6 +132,8 @@ def compile_kernel(
     started = time.perf_counter()
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     jaxpr_s = time.perf_counter() - started
+    if not may_draw and draws(closed):
+        raise UnsupportedError(DRAWN)
     leaves, out_tree = jax.tree.flatten(shape)
     traced: list[tuple[Graph, list[int]]] = []  # empty if the code was cached
 
@@ -153,20 +159,27 @@ def compile_kernel(
 
 
 def compile_resets(
-    begin: Callable[[Any], Any], target: Target, folder: Path | None, lanes: int, check: Check = no_check
+    begin: Callable[[Any], Any],
+    target: Target,
+    folder: Path | None,
+    lanes: int,
+    check: Check = no_check,
+    *,
+    may_draw: bool = False,
 ) -> Compilable:
     """Function from reset keys [lane, 4] to words of carries, compiled here by simd if possible and otherwise by JAX.
 
-    Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
-    the bits of those that JAX compiles may differ between processors.
+    Resets of Brax's own environments, for example, are JAX's. Resets are few compared with steps, but the bits of those
+    that JAX compiles may differ between processors.
 
     Args:
+        may_draw: see `Environment.compiles_drawn_resets`.
         lanes: number of resets that JAX computes at a time, that of one chunk. Their bits depend on it, and must not
             depend on how many chunks a worker computes together; another number would also have to be compiled.
     """
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     try:
-        kernel = compile_kernel(begin, key, target=target, folder=folder, check=check)
+        kernel = compile_kernel(begin, key, target=target, folder=folder, check=check, may_draw=may_draw)
     except UnsupportedError:
         resets = jitted(jax.vmap(begin))
 

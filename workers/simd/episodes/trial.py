@@ -28,9 +28,10 @@ from workers.simd.backend import cache
 from workers.simd.backend.native import OWN_VERSION
 from workers.simd.backend.words import pack, words_of
 from workers.simd.episodes.check import as_words
+from workers.simd.episodes.kernel import DRAWN
 from workers.simd.episodes.rollout import training_program, why_not
 from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.frontend.trace import draws, trace_jaxpr
 from workers.simd.frontend.tracer import line_of
 from workers.simd.graph.graph import Graph, reached
 from workers.simd.graph.operations import OPERATIONS
@@ -153,7 +154,8 @@ def _tried(task: TaskSpec, environment: Environment) -> Iterator[tuple[_Traced, 
     """(function, its input words, its output words, number of the step) of the reset, which is 0, and of the steps."""
     keys_L = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(LANES))
     try:
-        traced = _traced(lambda key: _after(environment, environment.reset(key)), KEY)
+        may_draw = environment.compiles_drawn_resets
+        traced = _traced(lambda key: _after(environment, environment.reset(key)), KEY, may_draw=may_draw)
         words = np.tile(keys_L.T, 2)
         values = _computed(traced, words)
         yield traced, words, values, 0
@@ -191,8 +193,10 @@ def _after(environment: Environment, state: Any) -> _After:
     return _After(None, None, environment.observe(state), environment.descriptor(state), state)
 
 
-def _traced(function: Callable[..., _After], *arguments: Any) -> _Traced:
+def _traced(function: Callable[..., _After], *arguments: Any, may_draw: bool = True) -> _Traced:
     closed, after = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    if not may_draw and draws(closed):
+        raise UnsupportedError(DRAWN)
     graph, _, outputs = trace_jaxpr(closed, folds_zeros=False)
     names = []
     for path, leaf in tree_flatten_with_path(after)[0]:

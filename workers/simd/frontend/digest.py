@@ -6,10 +6,17 @@ import hashlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from workers.simd.graph.unsupported import refusing
+
+
+def partitionable() -> bool:
+    """JAX's setting that says which of two ways random numbers are made of threefry keys."""
+    config: Any = jax.config
+    return config.jax_threefry_partitionable
 
 
 @refusing()
@@ -42,6 +49,8 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
         lines = [" ".join(map(name, [*jaxpr.constvars, *jaxpr.invars]))]
         for equation in jaxpr.eqns:
             parameters = [f"{key}={of_value(value)}" for key, value in sorted(equation.params.items()) if key != "name"]
+            if equation.primitive.name.startswith("random_"):
+                parameters.append(f"partitionable={partitionable()}")
             lines.append(f"{list(map(name, equation.outvars))} {equation.primitive.name} {parameters} "
                          f"{list(map(name, equation.invars))}")  # fmt: skip
         lines.append(" ".join(map(name, jaxpr.outvars)))
@@ -56,6 +65,8 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
         if isinstance(value, tuple | list):
             return f"({','.join(map(of_value, value))})"
         if isinstance(value, np.ndarray | np.generic | jax.Array):
+            if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+                return f"{value.dtype}{of_value(jax.random.key_data(jnp.asarray(value)))}"
             array = np.asarray(value)
             return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
         if callable(value):

@@ -12,10 +12,9 @@ from workers.simd.graph.unsupported import UnsupportedError, way_round
 
 @functools.cache
 def graph_dtype(dtype: Any) -> str:
-    """Dtype of the graph nodes that represent values of a JAX dtype: "f", "i" or "b".
+    """Dtype of the graph nodes that represent values of a JAX dtype: "f", "i", "b" or, of JAX's threefry keys, "k".
 
-    float32, int32, uint32 and bool are supported. uint8, which JAX uses to count bits, is accepted as well;
-    `check_bytes` ensures that it is only converted and moved.
+    Integers of 8 and 16 bits are 32-bit integers of the same value; see `overflows`.
 
     Raises:
         UnsupportedError: the dtype is any other.
@@ -23,24 +22,41 @@ def graph_dtype(dtype: Any) -> str:
     match str(dtype):
         case "float32":
             return "f"
-        case "int32" | "uint32" | "uint8":
+        case "int32" | "uint32" | "int16" | "uint16" | "int8" | "uint8":
             return "i"
         case "bool":
             return "b"
+        case "key<fry>":
+            return "k"
     advice = way_round("random_bits") if str(dtype).startswith("key<") else ""
-    raise UnsupportedError(f"values of type {dtype}: simd supports float32, int32, uint32 and bool", advice=advice)
+    raise UnsupportedError(
+        f"values of type {dtype}: simd supports float32, integers of 8, 16 and 32 bits, bool and threefry keys",
+        advice=advice,
+    )
 
 
-BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshape", "squeeze", "slice", "transpose",
-         "concatenate", "stack", "copy", "jit"}  # fmt: skip
-"""Primitives that may have uint8 inputs or outputs, because none of them can overflow."""
+def is_signed(dtype: str) -> bool:
+    """Whether integers of a JAX dtype may be negative."""
+    return dtype.startswith("int")
 
 
-def check_bytes(equation: Any) -> None:
-    """Raise UnsupportedError if an equation computes with uint8."""
-    atoms = (*equation.invars, *equation.outvars)
-    if equation.primitive.name not in BYTES and any(atom.aval.dtype == np.uint8 for atom in atoms):
-        raise UnsupportedError(f"{equation.primitive.name} of uint8")
+def bits_of(dtype: str) -> int:
+    """Number of bits of an integer dtype."""
+    return 8 * np.dtype(dtype).itemsize
+
+
+NARROW = {"int8", "int16", "uint8", "uint16"}
+MOVES = {"broadcast_in_dim", "reshape", "squeeze", "slice", "transpose", "concatenate", "stack", "unstack", "copy",
+         "select_n", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "jit", "while", "scan", "cond",
+         "random_bits"}  # fmt: skip
+"""Primitives that only move or choose integers, or whose parts reduce them."""
+
+
+def overflows(equation: Any) -> list[str]:
+    """For each output of an equation, the dtype of 8 or 16 bits to whose range it must be reduced, or ""."""
+    moves = equation.primitive.name in MOVES
+    dtypes = [str(variable.aval.dtype) for variable in equation.outvars]
+    return ["" if moves or dtype not in NARROW else dtype for dtype in dtypes]
 
 
 def dtype_in(equation: Any, position: int = 0) -> str:

@@ -7,16 +7,18 @@ kernel nothing. Arithmetic adds nodes.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
 from es_service.protocol.raised import is_users_file
-from workers.simd.frontend.dtypes import check_bytes, graph_dtype
+from workers.simd.frontend.dtypes import bits_of, graph_dtype, is_signed, overflows
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop, build_while
 from workers.simd.graph.unsupported import UnsupportedError, refusing, way_round
@@ -63,7 +65,7 @@ class Tracer:
 
     def closed(self, closed: ClosedJaxpr, inputs: Sequence[Nodes]) -> list[Nodes]:
         """Outputs of a jaxpr that comes with its constants."""
-        constants = [self.constants(np.asarray(value)) for value in closed.consts]
+        constants = [self.constants(value) for value in closed.consts]
         return self.jaxpr(closed.jaxpr, constants, inputs)
 
     def jaxpr(self, jaxpr: Jaxpr, constants: Sequence[Nodes], inputs: Sequence[Nodes]) -> list[Nodes]:
@@ -82,7 +84,6 @@ class Tracer:
                 if rule is None:
                     name = equation.primitive.name
                     raise UnsupportedError(f"the primitive {name}", advice=way_round(name))
-                check_bytes(equation)
                 with refusing():
                     outputs = rule(self, equation, *map(read, equation.invars))
                 if len(self.graph.keys) > GRAPH_LIMIT:
@@ -94,6 +95,10 @@ class Tracer:
                 raise
             if not isinstance(outputs, list):
                 outputs = [outputs]
+            outputs = [
+                self.wrapped(nodes, dtype) if dtype else nodes
+                for nodes, dtype in zip(outputs, overflows(equation), strict=True)
+            ]
             for variable, nodes in zip(equation.outvars, outputs, strict=True):
                 aval: Any = variable.aval
                 assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
@@ -104,11 +109,30 @@ class Tracer:
         return [read(atom) for atom in jaxpr.outvars]
 
     def constants(self, numbers: Any) -> Nodes:
-        """Nodes of constants, for an array of numbers."""
+        """Nodes of constants, for an array of numbers or of JAX's keys."""
+        if graph_dtype(getattr(numbers, "dtype", np.dtype(bool))) == "k":
+            return self.keys(self.constants(np.asarray(jax.random.key_data(numbers))))
         array = np.asarray(numbers)
         node_dtype = graph_dtype(array.dtype)
         made = self.graph.i if node_dtype == "i" else lambda value: self.graph.const(node_dtype, value)
         return np.array([made(value) for value in array.reshape(-1).tolist()], np.int64).reshape(array.shape)
+
+    def keys(self, words: Nodes) -> Nodes:
+        """Nodes of JAX's keys, for an array [..., 2] of their words."""
+        pairs = words.reshape(-1, 2).tolist()
+        return np.array([self.graph.pair(*pair) for pair in pairs], np.int64).reshape(words.shape[:-1])
+
+    def words(self, keys: Nodes) -> Nodes:
+        """Nodes of the words of JAX's keys [...], as an array [..., 2]."""
+        rows = [self.graph.words(node) for node in keys.reshape(-1).tolist()]
+        return np.array(rows, np.int64).reshape(*keys.shape, 2)
+
+    def wrapped(self, nodes: Nodes, dtype: str) -> Nodes:
+        """Integers reduced to the range of a dtype of 8 or 16 bits, as that dtype wraps around."""
+        if not is_signed(dtype):
+            return self.ops("iand", nodes, self.constants(np.int32(2 ** bits_of(dtype) - 1)))
+        by = self.constants(np.int32(32 - bits_of(dtype)))
+        return self.ops("ashr", self.ops("shl", nodes, by), by)
 
     def values(self, nodes: Nodes) -> NDArray | None:
         """Values of an array of nodes if all of them are constants, else None."""
@@ -141,38 +165,39 @@ class Tracer:
 
     def keep_loop(self, trips: int, body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]) -> list[Nodes]:
         """Values of `carry` after `trips` trips through `body`, which does not depend on the number of the trip."""
-        shaped = _shaping(carry)
-        results = build_loop(self.graph, trips, lambda nodes: _flat(body(shaped(nodes))), _flat(carry), self.lanes)
+        shaped, flat = _shaping(self, carry), self.flat
+        results = build_loop(self.graph, trips, lambda nodes: flat(body(shaped(nodes))), flat(carry), self.lanes)
         return shaped(results)
 
     def keep_while(
         self, condition: Callable[[list[Nodes]], Nodes], body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]
     ) -> list[Nodes]:
         """Values of `carry` after trips through `body` for as long as `condition`, one bool, holds."""
-        shaped = _shaping(carry)
+        shaped = _shaping(self, carry)
 
         def trip(nodes: list[int], active: int) -> list[int]:
             with self.within(active):
-                return _flat(body(shaped(nodes)))
+                return self.flat(body(shaped(nodes)))
 
         def holds(nodes: list[int]) -> int:
             return int(condition(shaped(nodes))[()])
 
-        return shaped(build_while(self.graph, holds, trip, _flat(carry), self.lanes))
+        return shaped(build_while(self.graph, holds, trip, self.flat(carry), self.lanes))
+
+    def flat(self, arrays: Sequence[Nodes]) -> list[int]:
+        """Nodes of arrays in one list, of a key those of its words."""
+        return [word for nodes in arrays for node in nodes.reshape(-1).tolist() for word in self.graph.words(node)]
 
 
-def _flat(arrays: Sequence[Nodes]) -> list[int]:
-    """Nodes of arrays in one list."""
-    return [node for nodes in arrays for node in nodes.reshape(-1).tolist()]
-
-
-def _shaping(arrays: Sequence[Nodes]) -> Callable[[Sequence[int]], list[Nodes]]:
-    """Function that gives nodes in one list the shapes of some arrays."""
-    shapes = [nodes.shape for nodes in arrays]
-    ends = np.cumsum([nodes.size for nodes in arrays], dtype=np.int64)
+def _shaping(t: Tracer, arrays: Sequence[Nodes]) -> Callable[[Sequence[int]], list[Nodes]]:
+    """Function that gives nodes in one list, as `Tracer.flat` makes it, the shapes of some arrays."""
+    of_keys = [bool(nodes.size) and t.graph.dtypes[nodes.flat[0]] == "k" for nodes in arrays]
+    shapes = [(*nodes.shape, 2) if keys else nodes.shape for keys, nodes in zip(of_keys, arrays, strict=True)]
+    ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=np.int64)
 
     def shaped(nodes: Sequence[int]) -> list[Nodes]:
         parts = np.split(np.array(nodes, np.int64), ends)[:-1]
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        shaped = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        return [t.keys(part) if keys else part for keys, part in zip(of_keys, shaped, strict=True)]
 
     return shaped

@@ -32,6 +32,22 @@ TANH = ((1.0, 0.13383980095386505, 0.0034989959094673395, 2.066126216959674e-05,
 
 For greater |x|, |tanh x| differs from 1 by at most the last bit.
 """
+LOG = (3.3333331174e-1, -2.4999993993e-1, 2.0000714765e-1, -1.6668057665e-1, 1.4249322787e-1, -1.2420140846e-1,
+       1.1676998740e-1, -1.1514610310e-1, 7.0376836292e-2)  # fmt: skip
+"""As LOG1P, but of Cephes (S. Moshier, 1989), whose logarithms XLA computes; for `erf_inv`."""
+LOG1P_RATIO = ((2.0039553499201281e1, 5.7112963590585538e1, 6.0949667980987788e1, 2.9911919328553073e1,
+                6.5787325942061045, 4.9854102823193376e-1, 4.5270000862445200e-5),
+               (6.0118660497603844e1, 2.1642788614495948e2, 3.0909872225312060e2, 2.2176239823732856e2,
+                8.3047565967967210e1, 1.5062909083469192e1, 1.0))  # fmt: skip
+"""As LOG, as a rational function (numerator, denominator), for |x| < sqrt(2) - 1."""
+ERF_INV = ((1.50140941, 0.246640727, -0.00417768164, -0.00125372503, 0.00021858087, -4.39150654e-06, -3.5233877e-06,
+            3.43273939e-07, 2.81022636e-08),
+           (2.83297682, 1.00167406, 0.00943887047, -0.0076224613, 0.00573950773, -0.00367342844, 0.00134934322,
+            0.000100950558, -0.000200214257))  # fmt: skip
+"""Coefficients of (inverse of erf) / x as polynomials in w - 5/2, for w = -log(1 - x^2) < 5, and in sqrt(w) - 3.
+
+M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2011); XLA has the same.
+"""
 ROUNDER = 1.5 * 2**23
 """Number whose addition rounds to integers.
 
@@ -210,12 +226,17 @@ def exp2(g: Graph, x: int) -> int:
     return _nan_where_nan(g, x, exponential)
 
 
-def log(g: Graph, x: int) -> int:
-    """Natural logarithm of x, within 2 ulp; -inf at 0, NaN below."""
+def _mantissa_and_power(g: Graph, x: int) -> tuple[int, int]:
+    """(rest, k) with x = (1 + rest) 2^k, where 1 + rest is from sqrt(1/2) to sqrt(2)."""
     bits = g.op("bits", x)
     power = g.op("ashr", g.op("isub", bits, g.i(0x3F3504F3)), g.i(23))  # 0x3F3504F3 are the bits of sqrt(1/2)
     mantissa = g.op("unbits", g.op("isub", bits, g.op("shl", power, g.i(23))))
-    rest, k = g.op("sub", mantissa, g.f(1.0)), g.op("float_of_int", power)
+    return g.op("sub", mantissa, g.f(1.0)), g.op("float_of_int", power)
+
+
+def log(g: Graph, x: int) -> int:
+    """Natural logarithm of x, within 2 ulp; -inf at 0, NaN below."""
+    rest, k = _mantissa_and_power(g, x)
     square = g.op("mul", rest, rest)
     curve = g.op("mul", g.op("mul", rest, square), _horner(g, rest, LOG1P))
     curve = g.op("fma", k, g.f(LOG_2[1]), curve)
@@ -234,6 +255,39 @@ def log1p(g: Graph, x: int) -> int:
     logarithm = g.op("select", g.op("lt", one_more, g.f(math.inf)), logarithm, one_more)
     logarithm = g.op("select", g.op("eq", one_more, g.f(0.0)), g.f(-math.inf), logarithm)
     return g.op("select", g.op("lt", g.op("abs", x), g.f(1e-7)), x, logarithm)
+
+
+def _log1p_of_cephes(g: Graph, x: int) -> int:
+    """log(1 + x) with the roundings of XLA's, which `erf_inv` shows near -1 and 1."""
+    square = g.op("mul", x, x)
+    above, below = (_horner(g, x, coefficients) for coefficients in LOG1P_RATIO)
+    curve = g.op("mul", g.op("mul", x, square), g.op("div", above, below))
+    near = g.op("add", x, g.op("fma", square, g.f(-0.5), curve))
+    rest, k = _mantissa_and_power(g, g.op("add", x, g.f(1.0)))
+    square = g.op("mul", rest, rest)
+    cube = g.op("mul", square, rest)
+    low, middle, high = (_horner(g, rest, LOG[start : start + 3]) for start in (0, 3, 6))
+    curve = g.op("mul", g.op("fma", g.op("fma", high, cube, middle), cube, low), cube)
+    curve = g.op("add", g.op("fma", square, g.f(-0.5), rest), g.op("fma", k, g.f(LOG_2[1]), curve))
+    far = g.op("fma", k, g.f(LOG_2[0]), curve)
+    return g.op("select", g.op("lt", g.op("abs", x), g.f(math.sqrt(2.0) - 1.0)), near, far)
+
+
+def erf_inv(g: Graph, x: int) -> int:
+    """The number whose erf is x, within 2 ulp of XLA's; infinite at -1 and 1, NaN beyond.
+
+    The square is rounded, as in XLA: it is not fused with the difference from 1.
+    """
+    square = g.op("unbits", g.op("bits", g.op("mul", x, x)))
+    w = g.op("neg", _log1p_of_cephes(g, g.op("neg", square)))
+    is_central = g.op("lt", w, g.f(5.0))
+    at = g.op("select", is_central, g.op("sub", w, g.f(2.5)), g.op("sub", g.op("sqrt", w), g.f(3.0)))
+    total = g.f(0.0)
+    for central, tail in zip(*map(reversed, ERF_INV), strict=True):
+        total = g.op("fma", total, at, g.op("select", is_central, g.f(central), g.f(tail)))
+    far = g.op("unbits", g.op("ior", g.i(0x7F800000), g.op("iand", g.op("bits", x), g.i(0x80000000))))
+    inside = g.op("select", g.op("lt", g.op("abs", x), g.f(1.0)), g.op("mul", total, x), g.f(math.nan))
+    return g.op("select", g.op("eq", g.op("abs", x), g.f(1.0)), far, inside)
 
 
 def tanh(g: Graph, x: int) -> int:

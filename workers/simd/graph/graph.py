@@ -46,9 +46,9 @@ class Graph:
     """An append-only graph. `keys[node]` defines a node: (operation, *argument nodes), or one of
 
     ("const", dtype, bits), ("input", dtype, position),
-    ("carry", dtype, loop, position), ("result", dtype, loop, position).
+    ("carry", dtype, loop, position), ("result", dtype, loop, position), ("pair", node, node).
 
-    A dtype is "f" (float32), "i" (32-bit integer) or "b" (bool).
+    A dtype is "f" (float32), "i" (32-bit integer), "b" (bool) or "k" (a pair).
     """
 
     def __init__(self) -> None:
@@ -114,8 +114,19 @@ class Graph:
         self.loops.append(Loop(number, trips, list(inits), carries))
         return self.loops[-1]
 
+    def pair(self, first: int, second: int) -> int:
+        """Node that stands for the two words of a key of JAX while tracing; no operation takes it."""
+        return self._node(("pair", first, second), "k")
+
+    def words(self, node: int) -> tuple[int, ...]:
+        """The nodes of the words for which a node stands: itself, or the two of a pair."""
+        return self.keys[node][1:] if self.dtypes[node] == "k" else (node,)
+
     def choose(self, mask: int, if_true: int, if_false: int) -> int:
         """Node that chooses between two nodes of the same dtype by a bool node."""
+        if self.dtypes[if_true] == "k":
+            words = zip(self.words(if_true), self.words(if_false), strict=True)
+            return self.pair(*(self.choose(mask, *both) for both in words))
         return self.op(SELECTS[self.dtypes[if_true]], mask, if_true, if_false)
 
     def close(self, loop: Loop, outs: list[int]) -> list[int]:

@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Iterator
 
 _UNIFORMS = (
-    "make random numbers by es_service.protocol.noise.uniforms(key, counters), with the key of reset and a counter in "
-    "the state"
+    "draw by JAX's own generator, threefry2x32, or by es_service.protocol.noise.uniforms(key, counters), with the key "
+    "of reset and a counter in the state"
 )
 _ONE_HOT = (
     "instead of array[index] write jax.nn.one_hot(index, len(array)) @ array, or with policy.output = argmax, whose "

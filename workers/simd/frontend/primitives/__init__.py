@@ -11,10 +11,22 @@ from workers.simd.frontend.primitives import (
     control,
     indexing,
     linear,
+    random,
     reductions,
     sorting,
     structure,
 )
 from workers.simd.frontend.primitives.registry import PRIMITIVES
 
-__all__ = ["PRIMITIVES", "arithmetic", "choices", "control", "indexing", "linear", "reductions", "sorting", "structure"]
+__all__ = [
+    "PRIMITIVES",
+    "arithmetic",
+    "choices",
+    "control",
+    "indexing",
+    "linear",
+    "random",
+    "reductions",
+    "sorting",
+    "structure",
+]

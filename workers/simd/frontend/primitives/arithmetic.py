@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from workers.simd.frontend.dtypes import dtype_in, graph_dtype
+from workers.simd.frontend.dtypes import bits_of, dtype_in, graph_dtype, is_signed
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
 from workers.simd.graph import division, elementary
@@ -37,7 +37,6 @@ PRIMITIVES["ceil"] = _by_dtype("ceil", None)
 PRIMITIVES["and"] = _by_dtype(None, "iand", "and")
 PRIMITIVES["or"] = _by_dtype(None, "ior", "or")
 PRIMITIVES["xor"] = _by_dtype(None, "ixor", "xor")
-PRIMITIVES["population_count"] = _by_dtype(None, "popcount")
 
 
 @primitive("div", "rem")
@@ -46,7 +45,7 @@ def _divide(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     if graph_dtype(dtype) == "f":
         return t.ops("div", a, b) if is_quotient else t.map(lambda x, y: division.remainder(t.graph, x, y), a, b)
     divide = division.whole_quotient if is_quotient else division.whole_remainder
-    return t.map(lambda x, y: divide(t.graph, x, y, dtype), a, b)
+    return t.map(lambda x, y: divide(t.graph, x, y, "int32" if is_signed(dtype) else "uint32"), a, b)
 
 
 @primitive("neg")
@@ -66,9 +65,9 @@ def _abs(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 @primitive("sign")
 def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     g = t.graph
-    if dtype_in(equation) == "int32":
-        zero = t.constants(np.int32(0))
-        above, below = t.ops("slt", zero, x), t.ops("slt", x, zero)
+    if graph_dtype(dtype_in(equation)) == "i":
+        zero, is_other = t.constants(np.int32(0)), "slt" if is_signed(dtype_in(equation)) else "ult"
+        above, below = t.ops(is_other, zero, x), t.ops(is_other, x, zero)
         return t.ops("isub", t.ops("int_of_bool", above), t.ops("int_of_bool", below))
     if graph_dtype(dtype_in(equation)) != "f":
         raise UnsupportedError(f"sign of {dtype_in(equation)}")
@@ -80,6 +79,18 @@ def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     return t.map(sign, x)
 
 
+@primitive("population_count", "clz")
+def _count(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    """Number of bits that are 1, or of leading bits that are 0."""
+    dtype, counts_ones = dtype_in(equation), equation.primitive.name == "population_count"
+    x = t.wrapped(x, dtype.replace("int", "uint") if is_signed(dtype) else dtype) if bits_of(dtype) < 32 else x
+    if counts_ones:
+        return t.ops("popcount", x)
+    for by in (1, 2, 4, 8, 16):  # ones from the first one on
+        x = t.ops("ior", x, t.ops("lshr", x, t.constants(np.int32(by))))
+    return t.ops("isub", t.constants(np.int32(bits_of(dtype))), t.ops("popcount", x))
+
+
 @primitive("square")
 def _square(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     return t.ops("mul" if graph_dtype(dtype_in(equation)) == "f" else "imul", x, x)
@@ -87,9 +98,14 @@ def _square(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 @primitive("integer_pow")
 def _integer_pow(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    if graph_dtype(dtype_in(equation)) != "f":
-        raise UnsupportedError(f"integer_pow of {dtype_in(equation)}")
-    return t.map(lambda n: elementary.whole_power(t.graph, n, equation.params["y"]), x)
+    exponent = equation.params["y"]
+    if graph_dtype(dtype_in(equation)) == "f":
+        return t.map(lambda n: elementary.whole_power(t.graph, n, exponent), x)
+    power, square = t.constants(np.ones(x.shape, np.int32)), x
+    while exponent:
+        power = t.ops("imul", power, square) if exponent & 1 else power
+        square, exponent = t.ops("imul", square, square), exponent >> 1
+    return power
 
 
 @primitive("round")
@@ -111,5 +127,5 @@ def _elementary(function: Callable[..., int]) -> Rule:
 
 
 for _name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "exp2", "expm1", "log", "log1p", "tanh",
-              "logistic", "rsqrt", "pow"):  # fmt: skip
+              "logistic", "rsqrt", "pow", "erf_inv"):  # fmt: skip
     PRIMITIVES[_name] = _elementary(getattr(elementary, _name))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.dtypes import dtype_in, graph_dtype
+from workers.simd.frontend.dtypes import bits_of, dtype_in, graph_dtype, is_signed
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph import elementary
@@ -23,7 +23,7 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     node_dtype = graph_dtype(dtype)
     if node_dtype == "f":
         return t.ops(name, a, b)
-    less = "slt" if dtype == "int32" else "ult"
+    less = "slt" if is_signed(dtype) else "ult"
     if node_dtype == "b":
         if name not in ("eq", "ne"):
             raise UnsupportedError(f"{name} of bool")
@@ -69,7 +69,7 @@ def extreme_of(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
     if node_dtype == "b":
         return lambda a, b: g.op("or" if name == "max" else "and", a, b)
     if node_dtype == "i":
-        less = "slt" if dtype == "int32" else "ult"
+        less = "slt" if is_signed(dtype) else "ult"
         return lambda a, b: g.op("iselect", g.op(less, a, b), *((b, a) if name == "max" else (a, b)))
 
     def extreme(a: int, b: int) -> int:
@@ -116,8 +116,6 @@ def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> list[Nod
 def _convert(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     g = t.graph
     source, target = dtype_in(equation), str(equation.params["new_dtype"])
-    if target == "uint8" and graph_dtype(source) == "i":
-        return t.ops("iand", x, t.constants(np.int32(255)))
     match graph_dtype(source), graph_dtype(target):
         case same, also if same == also:
             return x
@@ -140,12 +138,14 @@ def to_float(t: Tracer, dtype: str, x: Nodes) -> Nodes:
         case "b":
             return t.map(lambda n: t.graph.op("select", n, t.graph.f(1.0), t.graph.f(0.0)), x)
         case "i":
-            return t.ops("float_of_int" if dtype == "int32" else "float_of_uint", x)
+            return t.ops("float_of_uint" if dtype == "uint32" else "float_of_int", x)
     return x
 
 
 @primitive("bitcast_convert_type")
 def _bitcast(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    if equation.outvars[0].aval.shape != x.shape:
+        raise UnsupportedError(f"bitcast of {dtype_in(equation)} to {equation.params['new_dtype']}, of another size")
     match graph_dtype(dtype_in(equation)), graph_dtype(equation.params["new_dtype"]):
         case "f", "i":
             return t.ops("bits", x)
@@ -158,8 +158,19 @@ def _bitcast(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 @primitive("shift_left", "shift_right_logical", "shift_right_arithmetic")
 def _shift(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    name = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
-    by = t.values(b)
-    if by is None or (by < 0).any() or (by > 31).any():
-        raise UnsupportedError(f"{equation.primitive.name} by other than a constant from 0 to 31")
-    return t.ops(name[equation.primitive.name], a, b)
+    """Shifts by any numbers: all bits are shifted out by as many as there are, or more, or by a negative number."""
+    g, dtype, name = t.graph, dtype_in(equation), equation.primitive.name
+    bits = bits_of(dtype)
+    if name == "shift_right_logical" and is_signed(dtype) and bits < 32:
+        a = t.wrapped(a, f"u{dtype}")
+    if name == "shift_right_arithmetic" and not is_signed(dtype) and bits < 32:
+        a = t.wrapped(a, dtype[1:])
+
+    def shift(n: int, by: int) -> int:
+        within = g.op("ult", by, g.i(bits))
+        if name == "shift_right_arithmetic":
+            return g.op("ashr", n, g.op("iselect", within, by, g.i(31)))
+        shifted = g.op("shl" if name == "shift_left" else "lshr", n, g.op("iselect", within, by, g.i(0)))
+        return g.op("iselect", within, shifted, g.i(0))
+
+    return t.map(shift, a, b)

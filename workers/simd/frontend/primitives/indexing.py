@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax import lax
 
-from workers.simd.frontend.dtypes import dtype_in, graph_dtype
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype, is_signed
 from workers.simd.frontend.primitives.choices import extreme_of
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
@@ -40,7 +40,7 @@ class Corner(NamedTuple):
 
 def _corner(equation: Any, position: int, nodes: Mapping[int, int]) -> Corner:
     """Corner at indices with the dtype of the equation's input at `position`."""
-    return Corner(nodes, "slt" if dtype_in(equation, position) == "int32" else "ult")
+    return Corner(nodes, "slt" if is_signed(dtype_in(equation, position)) else "ult")
 
 
 def _known(
@@ -156,11 +156,16 @@ def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
 def _fill(t: Tracer, equation: Any) -> int:
     """Node of the value that a gather gives outside of its operand.
 
-    It is the primitive's fill value, or by dtype NaN, the least int32, the greatest uint32 or true.
+    It is the primitive's fill value, or by dtype NaN, the least signed integer, the greatest unsigned one or true.
     """
+    if graph_dtype(equation.outvars[0].aval.dtype) == "k":
+        raise UnsupportedError("a gather of keys that may lie outside of their array")
     dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
     if value is None:
-        value = {"float32": np.nan, "int32": -(2**31), "uint32": 2**32 - 1, "bool": True}[str(dtype)]
+        if dtype.kind in "iu":
+            value = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+        else:
+            value = np.nan if dtype.kind == "f" else True
     return int(t.constants(np.asarray(value).astype(dtype))[()])
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.dtypes import dtype_in, graph_dtype
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype, is_signed
 from workers.simd.frontend.primitives.choices import extreme_of, to_float
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
@@ -100,7 +100,7 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
     """Function that tells whether a node is more extreme than the best before it, as a bool node."""
     node_dtype = graph_dtype(dtype)
-    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(node_dtype)
+    less = {"f": "lt", "i": "slt" if is_signed(dtype) else "ult"}.get(node_dtype)
 
     def beats(node: int, best: int) -> int:
         low, high = (node, best) if name == "argmin" else (best, node)

@@ -46,6 +46,15 @@ def _top_k(t: Tracer, equation: Any, x: Nodes) -> list[Nodes]:
     return [np.take(rows, range(k), axis) for rows in found]
 
 
+@primitive("lt_to", "le_to")
+def _total_order(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    """Comparisons in a total order, in which -0 comes before 0, and NaN, whatever its sign, after all numbers."""
+    a, b = (_keys(t, dtype_in(equation), x, signed_zeros=True) for x in (a, b))
+    if equation.primitive.name == "lt_to":
+        return t.ops("slt", a, b)
+    return t.map(lambda n: t.graph.op("xor", t.graph.const("b", True), n), t.ops("slt", b, a))
+
+
 def _positions(t: Tracer, shape: tuple[int, ...], axis: int) -> Nodes:
     """Nodes of the position of each element along an axis."""
     along = np.arange(shape[axis], dtype=np.int32)
