@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,46 @@ def test_what_simd_lacks_is_refused_with_the_line_of_the_user(monkeypatch: pytes
     monkeypatch.delitem(PRIMITIVES, "cholesky")
     with pytest.raises(UnsupportedError, match=r"^the primitive cholesky \(at .*/test_mujoco_parts\.py:[0-9]+ \("):
         compile_kernel(lambda state: mujoco_parts.step(mx, state, np.zeros(0)), mujoco_parts.start(mx))
+
+
+def sliding_balls(cone: str) -> MjModel:
+    """Four balls in a row on a floor that touch each other; their contacts have two kinds of rows."""
+    slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+    balls = "".join(
+        f'<body pos="{0.2 * number:.1f} 0 0.1">{slides}<geom size="0.1" condim="{dim}" mass="1"/></body>'
+        for number, dim in enumerate((4, 3, 3, 4))
+    )
+    world = f'<worldbody><geom type="plane" size="5 5 1" condim="3"/>{balls}</worldbody>'
+    return mujoco_models.as_c(mujoco.MjModel.from_xml_string(f'<mujoco><option cone="{cone}"/>{world}</mujoco>'))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cone", "within"), [("pyramidal", 1e-4), pytest.param("elliptic", 2e-3, marks=pytest.mark.long)]
+)
+def test_forces_are_the_same_however_many_contacts_are_solved_at_once(cone: str, within: float):
+    """In states with few contacts, and in states with more than are solved at once."""
+    model, rng = sliding_balls(cone), np.random.default_rng(0)
+    mx = mujoco_parts.put_model(model)
+    data: Any = mujoco_parts.mjx.make_data(mx)
+    qpos = (rng.choice([-1e-3, 0.3], (64, model.nq)) * rng.random((64, model.nq))).astype(np.float32)
+    qvel = rng.normal(0.0, 0.3, qpos.shape).astype(np.float32)
+
+    def forward(at_once: int, qpos: Any, qvel: Any) -> tuple[Any, ...]:
+        state = mujoco_parts.start(mx, qpos, qvel)
+        found = mujoco_parts._forward(mx, mujoco_parts._data(data, state, np.zeros(0)), at_once)
+        return found.qacc, found.qfrc_constraint, found._impl.efc_force, found._impl.contact.dist
+
+    *right, dist = compile_kernel(functools.partial(forward, 1000), qpos[0], qvel[0])(qpos, qvel)
+    groups = [np.flatnonzero(data._impl.contact.dim == dim) for dim in (3, 4)]
+    most = np.max([(dist < 0)[:, group].sum(1) for group in groups], axis=0)
+    assert (most <= 1).sum() >= 5
+    assert (most > 1).sum() >= 5
+    few = compile_kernel(functools.partial(forward, 1), qpos[0], qvel[0])
+    for ours, all_at_once in zip(few(qpos, qvel), right, strict=False):
+        scale = float(np.abs(all_at_once).max())
+        assert scale > 1.0
+        np.testing.assert_allclose(ours, all_at_once, atol=within * scale)
 
 
 POLE = """<body name="pole" pos="-1 0 0.5">

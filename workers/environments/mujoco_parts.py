@@ -3,7 +3,8 @@
 A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
 implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
 makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
-own and is used as it is, but for RK4 and the contacts of capsules with planes.
+own and is used as it is, but for RK4, the contacts of capsules with planes, and which contacts are solved
+(`mujoco_contacts.py`).
 
 Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
 (`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
@@ -24,12 +25,13 @@ import numpy as np
 
 from workers.environments import TaskError
 from workers.environments.brax_parts import Transform, quietly
+from workers.environments.mujoco_contacts import AT_ONCE, solve
 from workers.viewer import Viewer
 
 mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains
 with quietly():
     from mujoco import mjx
-    from mujoco.mjx._src import collision_driver, collision_primitive, support, types
+    from mujoco.mjx._src import collision_driver, collision_primitive, sensor, support, types
     from mujoco.mjx._src import forward as forward_of_mjx
 
 MjModel = Any
@@ -108,7 +110,12 @@ def step(model: mjx.Model, state: MujocoState, ctrl: Any, substeps: int = 1) -> 
 
 
 def step_and_look(
-    model: mjx.Model, state: MujocoState, ctrl: Any, substeps: int, look: Callable[[mjx.Data], Any]
+    model: mjx.Model,
+    state: MujocoState,
+    ctrl: Any,
+    substeps: int,
+    look: Callable[[mjx.Data], Any],
+    at_once: int = AT_ONCE,
 ) -> tuple[MujocoState, Any]:
     """As `step`, with what a function sees in the data of the last substep.
 
@@ -117,12 +124,14 @@ def step_and_look(
 
     Args:
         look: function from data to a pytree of arrays.
+        at_once: contacts of each `condim` that are computed first; only where more are active, all are computed. The
+            number changes the speed, and results by rounding.
     """
     empty = mjx.make_data(model)
-    integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _mjx_step
+    integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _single_stage
 
     def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
-        return integrate(model, _data(empty, before[0], ctrl), look), None
+        return integrate(model, _data(empty, before[0], ctrl), look, at_once), None
 
     with _contacts_as_c():
         first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
@@ -130,16 +139,25 @@ def step_and_look(
         return substep(begun, None)[0] if substeps == 1 else jax.lax.scan(substep, begun, None, length=substeps)[0]
 
 
-def _mjx_step(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
-    data = mjx.step(model, data)
-    return _state(data), look(data)
+INTEGRATORS = {
+    types.IntegratorType.EULER: forward_of_mjx.euler,
+    types.IntegratorType.IMPLICITFAST: forward_of_mjx.implicit,
+}
+"""What MJX does after the forces are known, by the integrator; for RK4 see `_runge_kutta`."""
 
 
-STAGES = np.array([[0.0, 0.5, 0.5, 1.0], np.array([1, 2, 2, 1]) / 6]).T
-"""Of each stage of RK4: how far its state is along the step, by the rates of the stage before, and its weight."""
+def _single_stage(
+    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], at_once: int
+) -> tuple[MujocoState, Any]:
+    """A substep of an integrator that computes forces once, and what is seen in it."""
+    found = _forward(model, data, at_once)
+    after = INTEGRATORS[model.opt.integrator](model, found)
+    return _state(after), look(found.replace(qpos=after.qpos, qvel=after.qvel, act=after.act, time=after.time))
 
 
-def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any]) -> tuple[MujocoState, Any]:
+def _runge_kutta(
+    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], at_once: int
+) -> tuple[MujocoState, Any]:
     """A substep of RK4, and what is seen in its fourth stage.
 
     It is MJX's with the stages in a loop, since four copies of the physics take four times as long to compile, and with
@@ -152,21 +170,23 @@ def _runge_kutta(model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], An
         qvel, qacc, act_dot = jax.tree.map(lambda rate: share * rate, rates)
         return advanced(model, data, act_dot, qacc, qvel)
 
-    def stage(carry: tuple[Any, Any, Any], numbers: Any) -> tuple[tuple[Any, Any, Any], None]:
+    def stage(number: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        """Rates of the state that is a share of a step away by the rates of the stage before."""
         rates, sums, _ = carry
-        at = moved(rates, numbers[0])
-        found = mjx.forward(model, at.replace(qacc_warmstart=data.qacc_warmstart))
-        share_of_step = numbers[0] * model.opt.timestep
-        turned = _turning(model, share_of_step * rates[0], found.qvel)
+        is_inner = (number == 1) | (number == 2)
+        share = jnp.where(number == 0, 0.0, jnp.where(is_inner, 0.5, 1.0))
+        weight = jnp.where(is_inner, 1.0 / 3.0, 1.0 / 6.0)
+        at = moved(rates, share)
+        found = _forward(model, at.replace(qacc_warmstart=data.qacc_warmstart), at_once)
+        turned = _turning(model, share * model.opt.timestep * rates[0], found.qvel)
         rates = turned, found.qacc, found.act_dot
-        sums = jax.tree.map(lambda total, rate: total + numbers[1] * rate, sums, rates)
-        return (rates, sums, (found.qacc, look(found))), None
+        sums = jax.tree.map(lambda total, rate: total + weight * rate, sums, rates)
+        return rates, sums, (found.qacc, look(found))
 
     still = jax.tree.map(jnp.zeros_like, (data.qvel, data.qacc, data.act_dot))
-    shapes = jax.eval_shape(lambda: stage((still, still, None), STAGES[0])[0][2])
+    shapes = jax.eval_shape(lambda: stage(0, (still, still, None))[2])
     unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    stages = jnp.asarray(STAGES, data.qvel.dtype)
-    (_, rates, (qacc, seen)), _ = jax.lax.scan(stage, (still, still, unseen), stages)
+    _, rates, (qacc, seen) = jax.lax.fori_loop(0, 4, stage, (still, still, unseen))
     return _state(moved(rates, 1.0).replace(qacc_warmstart=qacc)), seen
 
 
@@ -193,7 +213,17 @@ def _turning(model: mjx.Model, moved: Any, qvel: Any) -> Any:
 def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
     """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors."""
     with _contacts_as_c():
-        return mjx.forward(model, _data(mjx.make_data(model), state, ctrl))
+        return _forward(model, _data(mjx.make_data(model), state, ctrl), AT_ONCE)
+
+
+def _forward(model: mjx.Model, data: Any, at_once: int) -> Any:
+    """`mjx.forward` with the constraints solved by `mujoco_contacts.solve`, whose argument `at_once` is."""
+    data = sensor.sensor_pos(model, forward_of_mjx.fwd_position(model, data))
+    data = sensor.sensor_vel(model, forward_of_mjx.fwd_velocity(model, data))
+    data = forward_of_mjx.fwd_acceleration(model, forward_of_mjx.fwd_actuation(model, data))
+    if not data._impl.efc_J.size:
+        return data.replace(qacc=data.qacc_smooth)
+    return sensor.sensor_acc(model, solve(model, data, at_once))
 
 
 def mujoco_viewer(model: MjModel, mx: mjx.Model, step_s: float, physics: Callable[[Any], MujocoState]) -> Viewer:

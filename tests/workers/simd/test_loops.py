@@ -397,6 +397,25 @@ def test_a_short_loop_whose_end_depends_on_data_becomes_straight_code(monkeypatc
     assert len(regions(doubled, X[0])) == 1  # without a bound
 
 
+def test_a_branch_with_loops_that_few_lanes_need_is_a_loop_of_one_trip() -> None:
+    """Its code is outside of the vectors that do not need it, which `cond` computes but for its loops."""
+
+    def function(x):
+        def once(carry):
+            return False, lax.fori_loop(0, 20, lambda _, x: settle(x), carry[1])
+
+        return lax.while_loop(lambda carry: carry[0], once, (x[0] > 0.5, x))[1]
+
+    outer, inner = regions(function, X[0])
+    assert outer.loop is not None
+    assert outer.loop.active is not None
+    assert inner.loop is not None
+    assert inner.loop.trips == 20
+    assert 0 < (X[:, 0] > 0.5).sum() < len(X)
+    check(function)
+    assert [times for _, times in trips_made(function, np.minimum(X, 0.5))] == [0, 0]
+
+
 def check_random_while(data: st.DataObject) -> None:
     """Loops that end by their carries, with random bodies, one inside another now and then."""
     inner_too, most = data.draw(st.booleans()), data.draw(st.floats(0.5, 2.0))

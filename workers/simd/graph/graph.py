@@ -151,7 +151,8 @@ class Graph:
 
         for k, active in enumerate(loop.carries):
             key = self.keys[outs[k]]
-            if key[0] == "and" and active in key[1:]:
+            is_over = self.dtypes[outs[k]] == "b" and self.constant(outs[k]) is not None and not self.constant(outs[k])
+            if is_over or (key[0] == "and" and active in key[1:]):
                 others = (pair for j, pair in enumerate(zip(loop.carries, outs, strict=True)) if j != k)
                 if all(kept_without(active, carry, out) for carry, out in others):
                     return k

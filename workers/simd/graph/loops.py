@@ -83,12 +83,14 @@ def build_while(
     # In straight code values go on after the end and only the results are chosen. So a counter stays a constant, and
     # the condition after the last possible trip folds to false.
     active, nodes, results = first, list(inits), list(inits)
-    for _ in range(1 + min(UNROLLED_OPERATIONS // max(1, _operations(graph, inside)), MOST_STRAIGHT_TRIPS)):
+    trips = min(UNROLLED_OPERATIONS // max(1, _operations(graph, inside)), MOST_STRAIGHT_TRIPS)
+    for number in range(trips + 1):
         if graph.constant(active) is not None and not graph.constant(active):
             return results
-        nodes = body(nodes, active)
-        results = chosen(active, nodes, results)
-        active = graph.op("and", active, condition(nodes))
+        if number < trips:
+            nodes = body(nodes, active)
+            results = chosen(active, nodes, results)
+            active = graph.op("and", active, condition(nodes))
     return _reduced(graph, loop, trip, outs, inside)[1:]
 
 
