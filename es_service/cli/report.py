@@ -126,13 +126,13 @@ def _compare(
 def export(
     folder: RunArgument,
     to: Annotated[
-        str, typer.Option("--to", help="Format: csv, parquet, npz, ribs or tensorboard.", show_default=False)
+        str, typer.Option("--to", help="Format: csv, parquet, npz, onnx, ribs or tensorboard.", show_default=False)
     ],
     out: Annotated[
         Path | None, typer.Option("--out", parser=given_path, help="Folder to write into; default: RUN/export.")
     ] = None,
 ) -> None:
-    """Write history, novelty archive and behaviour map as tables, the policies as arrays, or the history as events."""
+    """Write history, novelty archive and map as tables, policies as arrays or models, or the history as events."""
     from es_service.runs.export import export as write
 
     for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):

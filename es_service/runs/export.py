@@ -1,4 +1,4 @@
-"""Export of a run as tables (csv, parquet), arrays (npz), a pyribs archive (ribs) or files of TensorBoard."""
+"""Export of a run: tables (csv, parquet), arrays (npz), models (onnx), a pyribs archive (ribs), TensorBoard files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import numpy as np
 from es_service.config.text import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.protocol.parameters import ParameterSpec
-from es_service.runs.snapshot import Snapshot, map_places
+from es_service.runs.certified import newest_certified
+from es_service.runs.onnx import about, model_card, onnx_model
+from es_service.runs.snapshot import Policy, Snapshot, map_places
 from es_service.runs.trackers import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -269,6 +271,22 @@ def _npz(run: Run, folder: Path) -> list[Path]:
     return [file]
 
 
+def _onnx(run: Run, folder: Path) -> list[Path]:
+    certified, snapshot = newest_certified(run.folder), run.at(wanted=is_no_elite)
+    policies: dict[str, Policy] = {} if certified is None else {"certified": run.policy("certified")}
+    policies["best"] = snapshot.policy("best")
+    if snapshot.newest_centre is not None:
+        policies["centre"] = snapshot.policy("centre")
+    written = []
+    for name, policy in policies.items():
+        model = onnx_model(policy, about(run, certified if name == "certified" else None))
+        written.append(_new(folder, f"{name}.onnx"))
+        written[-1].write_bytes(model.SerializeToString())
+    card = _new(folder, "model_card.md")
+    card.write_text(model_card(run, [file.name for file in written], certified), encoding="utf-8")
+    return [*written, card]
+
+
 def _ribs(run: Run, folder: Path) -> list[Path]:
     file = _new(folder, "archive.pickle")
     archive = ribs_archive(run)
@@ -291,6 +309,7 @@ FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
     "csv": _csv,
     "parquet": _parquet,
     "npz": _npz,
+    "onnx": _onnx,
     "ribs": _ribs,
     "tensorboard": _tensorboard,
 }

@@ -69,6 +69,11 @@ class Policy:
             )
         return self.act(observation)[0]
 
+    @property
+    def layers(self) -> list[tuple[FloatArray, FloatArray | None]]:
+        """(weights [in, out], biases [out] or None) of each layer; a memory has two, its gates and its candidate."""
+        return split_layers(self.spec, self.parameters_D)
+
     def start(self) -> Callable[[Any], FloatArray]:
         """Function from the observations of one episode, one after another, to actions; of several episodes at once if
         they have leading axes. Each call of it continues the memory, if the policy has one."""
@@ -92,7 +97,7 @@ class Policy:
             )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
         before = initial_memory(np, self.spec, *x.shape[:-1]) if memory is None else memory
-        outputs, after = act(np, self.spec, split_layers(self.spec, self.parameters_D), before, x, dense_of_each)
+        outputs, after = act(np, self.spec, self.layers, before, x, dense_of_each)
         return action(np, self.spec.output, outputs), after
 
 

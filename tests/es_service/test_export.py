@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from es_service import api
+from es_service.config.keys import policy_of
 from es_service.errors import StoreError
+from es_service.runs.certification import certify_run
 from es_service.runs.export import arrays, export, tables
+from es_service.runs.onnx import onnx_model
+from es_service.runs.snapshot import Policy
 from es_service.store import reader
 from tests.database import execute
 from tests.run_examples import write_run
@@ -41,6 +45,54 @@ def after_a_generation(run, read):
         return read(*arguments)
 
     return read_later
+
+
+POLICIES = [
+    {},
+    {"hidden": [], "bias": False, "output": "linear"},
+    {"hidden": [7, 5], "activation": "relu", "output": "argmax"},
+    {"output": "categorical"},
+    {"output": "gaussian"},
+    {"memory": 3},
+    {"memory": 6, "hidden": [5], "bias": False, "output": "argmax"},
+]
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("clip", [None, 1.5])
+def test_a_model_has_the_actions_of_its_policy(kind, clip):
+    """By onnxruntime, for episodes side by side, step by step."""
+    onnxruntime, rng = pytest.importorskip("onnxruntime"), np.random.default_rng(0)
+    values = {"hidden": [8], "activation": "tanh", "output": "tanh", "bias": True, "memory": None, **kind}
+    spec = policy_of({f"policy.{name}": value for name, value in values.items()}, 4, 3)
+    parameters_D, mean_O = (rng.normal(size=size).astype(np.float32) for size in (spec.parameters, 4))
+    policy = Policy(spec, parameters_D, mean_O, np.float32([0.5, 1.0, 2.0, 3.0]), clip)
+    session = onnxruntime.InferenceSession(onnx_model(policy, {"task": "t"}).SerializeToString())
+    assert session.get_modelmeta().custom_metadata_map == {"task": "t"}
+    act, memory = policy.start(), np.zeros((16, spec.memory), np.float32)
+    for _ in range(5):
+        observation = rng.normal(0.0, 3.0, (16, 4)).astype(np.float32)
+        given = {"observation": observation} | ({"memory": memory} if spec.memory else {})
+        action, *after = session.run(None, given)
+        np.testing.assert_allclose(action, act(observation), atol=2e-6)
+        assert action.shape == (16, 3)
+        memory = after[0] if spec.memory else memory
+
+
+def test_exported_models_have_a_card_whose_code_runs(run, tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    certify_run(run.folder, episodes=8)
+    files = {file.name: file for file in export(run, "onnx", tmp_path)}
+    assert list(files) == ["certified.onnx", "best.onnx", "centre.onnx", "model_card.md", "SHA256SUMS"]
+    card = files["model_card.md"].read_text()
+    [value] = api.open_run(run.folder).certified.return_mean
+    assert f"**{value:.6g}** (95 % interval" in card
+    assert "| numpy |" in card
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(card.partition("```python\n")[2].partition("```")[0], names)  # as users copy it
+    observation = np.zeros((1, run.policy_spec.widths[0]), np.float32)
+    np.testing.assert_allclose(names["action"], run.policy("certified")(observation), atol=1e-6)
 
 
 @pytest.mark.slow
