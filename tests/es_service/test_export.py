@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.config.keys import policy_of
+from es_service.config.resolution import policy_of
 from es_service.errors import StoreError
 from es_service.runs.certification import certify_run
 from es_service.runs.export import arrays, export, tables
