@@ -26,7 +26,15 @@ from es_service.config.tasks import CALLER, task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
 from es_service.protocol.evaluator import Session
-from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
+from es_service.protocol.messages import (
+    ChunkResult,
+    EpisodesResult,
+    FloatArray,
+    GradientChunk,
+    Moments,
+    Work,
+    WorkerSpec,
+)
 from es_service.protocol.parent import require_same_process
 from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
@@ -34,7 +42,7 @@ from es_service.runs.session import OnNotice, Outcome, warn
 from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
-from workers.asking import Rows, Told, gradients, results_of, rows_of
+from workers.asking import Rows, gradients, results_of, rows_of
 from workers.host.policies import LanePolicies
 
 MOST_STEPS = 2**31 - 1
@@ -203,7 +211,9 @@ class AskTell:
                 raise ConfigError(f"moments must be {allowed}", field="moments", allowed=allowed)
             observed = Moments(number, mean_O, m2_O)
         self._asked = None
-        told = Told(fitness_N, descriptor_N_B, steps_N.astype(np.int32), observed)
+        distance_N_2 = np.full((count, 2), np.nan, np.float32)
+        steps_N = steps_N.astype(np.int32)
+        told = EpisodesResult(fitness_N, fitness_N, descriptor_N_B, steps_N, distance_N_2, observed)
         self._go_on(results_of(self._spec, self._work, told))
 
     def _go_on(self, results: list[ChunkResult] | None = None) -> None:

@@ -49,17 +49,6 @@ class Rows:
     """Whether a row is an episode of training, whose actions have noise."""
 
 
-@dataclass(frozen=True)
-class Told:
-    """Results of the caller."""
-
-    fitness_N: FloatArray
-    descriptor_N_B: FloatArray
-    steps_N: NDArray[np.int32]
-    moments: Moments
-    """Of all observations of the rows with noise."""
-
-
 def gradients(spec: WorkerSpec, work: Sequence[Work]) -> list[ChunkResult]:
     """Results of gradient chunks, which need no episodes."""
     kind = _kinds(spec)[GradientChunk]
@@ -89,8 +78,12 @@ def rows_of(spec: WorkerSpec, work: Sequence[Work]) -> Rows:
     return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[ChunkResult]:
-    """Results of the chunks of which `rows_of` has made rows."""
+def results_of(spec: WorkerSpec, work: Sequence[Work], told: EpisodesResult) -> list[ChunkResult]:
+    """Results of the chunks of which `rows_of` has made rows.
+
+    Args:
+        told: fitness, descriptor and steps of each row, and moments of all observations of the rows with noise.
+    """
     kinds, results, first = _kinds(spec), [], 0
     for subject, chunk in work:
         arguments = kinds[type(chunk)].arguments([(subject, chunk)])
@@ -106,8 +99,9 @@ def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[Chunk
     return _with_moments(results, told.moments)
 
 
-def _with_moments(results: list[ChunkResult], moments: Moments) -> list[ChunkResult]:
+def _with_moments(results: list[ChunkResult], moments: Moments | None) -> list[ChunkResult]:
     """The results, of which the first one with moments has all of them, and the others have none."""
+    assert moments is not None, "moments of no observation are moments, too"
     for place, result in enumerate(results):
         if isinstance(result, EpisodesResult) and result.moments is not None:
             results[place] = replace(result, moments=moments)
@@ -140,14 +134,14 @@ def _quiet(parameters: Any, mean: Any, std: Any, keys_N_4: Any) -> tuple[Any, ..
     return (*shared, seeds, keys_N_4, np.zeros(count, bool))
 
 
-def _episodes(spec: WorkerSpec, told: Told, rows: slice, is_told: Any, training: bool) -> Episodes:
+def _episodes(spec: WorkerSpec, told: EpisodesResult, rows: slice, is_told: Any, training: bool) -> Episodes:
     """Episodes as from a rollout; the observations are told as moments, so that their sums are 0."""
-    descriptor = np.zeros((*is_told.shape, told.descriptor_N_B.shape[1]), np.float32)
+    descriptor = np.zeros((*is_told.shape, told.descriptor.shape[1]), np.float32)
     fitness, steps = np.zeros(is_told.shape, np.float32), np.zeros(is_told.shape, np.int32)
     fitness[is_told], steps[is_told], descriptor[is_told] = (
-        told.fitness_N[rows],
-        told.steps_N[rows],
-        told.descriptor_N_B[rows],
+        told.fitness[rows],
+        told.steps[rows],
+        told.descriptor[rows],
     )
     sums = np.zeros((*is_told.shape, spec.policy.widths[0] if training else 0), np.float32)
     points = 0 if training else min(TRACE_POINTS, spec.episode_steps + 1)
