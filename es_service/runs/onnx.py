@@ -157,7 +157,7 @@ def model_card(run: Run, files: Sequence[str], certified: Certified | None) -> s
     if certified is None:
         lines.append(
             "No policy of this run is certified. The values that a run stores for its best policies are selected, so "
-            "they are too high on the average. `es-service evaluate RUN --certify` certifies a policy."
+            "they are too high on the average; certify a policy to know its value."
         )
     else:
         row = certified.row()
