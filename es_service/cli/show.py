@@ -19,9 +19,9 @@ from es_service.cli.tables.overview import NOT_STARTED, print_overview
 from es_service.cli.tables.status import follow_status, print_status
 from es_service.config.given import shipped_text
 from es_service.config.keys import unknown_key
-from es_service.config.loading import described_keys
 from es_service.config.tasks import TASKS
 from es_service.config.text import one_of
+from es_service.config.values import described_keys
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.system import given_path
 from es_service.runs.folders import runs_of

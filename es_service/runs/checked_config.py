@@ -1,4 +1,5 @@
-"""Configs checked against all known tasks and searches, including those of the user.
+"""Configs checked against all known tasks and searches, including those of the user, and against a run that is to go on
+with them: cores of this machine, constants of the run, its task, the columns of its tables, and if asked for its code.
 
 A config that its search refuses fails here, before a folder is created or a worker is started.
 """
@@ -6,18 +7,31 @@ A config that its search refuses fails here, before a folder is created or a wor
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from es_service.config import changes
-from es_service.config.changes import changed_constants
+from es_service.config.changes import changed_constants, refused_changes
 from es_service.config.given import Overrides, Source
 from es_service.config.keys import search_fields
 from es_service.config.loading import Known, read
 from es_service.config.model import RunConfig
 from es_service.config.parts import TASK_OPTIONS
-from es_service.config.tasks import ROLLOUTS, TASKS, task_of
+from es_service.config.tasks import CALLER, ROLLOUTS, TASKS, task_of
+from es_service.config.text import show
+from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.loop.budget import REACHED, limits_of, raised
+from es_service.loop.history import Column, evaluated_columns, history_columns
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import defaults_of
+from es_service.runs.identity import require_unchanged
+from es_service.runs.run_status import RunStatus, read_status
+from es_service.runs.view import open_run
+from es_service.runs.worker_count import require_cores
 from es_service.search.algorithms import ALGORITHMS
+from es_service.store.folder import CONFIG
+from es_service.store.schema import RunMeta
+from es_service.store.writer import RunStore
 
 KNOWN = Known(TASKS, ALGORITHMS, ROLLOUTS)
 """All tasks, searches and rollouts that a config may name."""
@@ -62,3 +76,82 @@ def accepted(config: RunConfig) -> RunConfig:
     """Return the config if its search accepts it; otherwise raise the ConfigError of the search."""
     ALGORITHMS[config.search.algorithm](config)
     return config
+
+
+KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
+"""Fields of a task that the policies and the history of a run depend on."""
+
+
+def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, Any], *, strict: bool) -> None:
+    """Raise an error if a run cannot be continued with a config on this machine.
+
+    Args:
+        asked: settings of the call, which ways out repeat.
+        strict: whether to refuse other code, other packages and another kind of processor, too.
+
+    Raises:
+        ConfigError: a constant of the run would change (all are listed), the task has changed, the workers are too many
+            for the cores of this machine, or `strict` is set and something has changed. StoreError: the run has other
+            columns than this version writes.
+    """
+    folder = store.folder
+    require_cores(config, WayOut("resume", "", str(folder), asked))
+    if changes := changes_from(store.meta.constants, config):
+        refusal = refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_status(open_run(folder))))
+        if config.task.environment == CALLER:
+            refusal.ways_out = (WayOut("ask_tell", "begin another run with these settings", "ANOTHER_FOLDER"),)
+        elif store.generation is None:
+            purpose = (
+                "begin another run with these settings, since this one has no generation that a fork could continue"
+            )
+            refusal.ways_out = (WayOut("run", purpose, settings=asked, config=str(folder / CONFIG)),)
+        raise refusal
+    task = task_of(config)
+    if other := _other_task(store.meta.task, task):
+        raise ConfigError(
+            f"{folder}: the task {config.task.environment} has changed since the run was created ({other}), so the "
+            "run's data do not fit it; undo the change, or start a new run",
+            field="task.environment",
+            value=config.task.environment,
+            run=folder,
+        )
+    if not _fits(store.meta, *columns(config, task)):
+        raise StoreError(
+            f"{folder} was written by a version of es-service with other history columns; continue it with that "
+            "version",
+            run=folder,
+            ways_out=[WayOut("fork", "continue from its state in a new run", str(folder))],
+        )
+    if strict:
+        require_unchanged(store, config)
+
+
+def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
+    """The columns of a run's history, and those of its evaluated centres."""
+    has_map, corrects = config.map.enabled, config.map.correct_every is not None
+    history = history_columns(task, has_map, corrects, config.search.allow_infeasible)
+    return history, evaluated_columns(task, has_map)
+
+
+def _budget_of_a_fork(config: RunConfig, status: RunStatus) -> dict[str, Any]:
+    """Budget settings that a fork needs besides the changed keys: the limits in `config` that differ from those of the
+    run, and larger limits where they are already spent."""
+    limits = limits_of(config.budget)
+    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != status.limits.get(key)}
+    wanted |= raised(limits, status.row) if status.row else {}
+    return {f"budget.{key}": value for key, value in wanted.items()}
+
+
+def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
+    """Differences between the recorded task and the present one that the run's data depend on; empty if none."""
+    present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
+    values = [(name, recorded[name], present[name]) for name in KEPT_OF_A_TASK]
+    return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
+
+
+def _fits(meta: RunMeta, history: tuple[Column, ...], evaluations: tuple[Column, ...]) -> bool:
+    """Whether this version can continue the tables of a run, which may lack columns that are not in the digest."""
+    lacking = [column for column in evaluations if column not in meta.evaluation_columns]
+    kept = tuple(column for column in evaluations if column not in lacking)
+    has_all = not any(column.deterministic for column in lacking)
+    return meta.columns == history and meta.evaluation_columns == kept and has_all

@@ -44,7 +44,7 @@ from es_service.protocol.messages import (
     evaluation_chunks,
 )
 from es_service.protocol.policies import Policies
-from es_service.runs.resume_checks import columns
+from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
 from es_service.search.novelty import extended

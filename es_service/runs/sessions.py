@@ -23,8 +23,7 @@ from es_service.protocol.evaluator import Session
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs import targets
 from es_service.runs.certified import target_reached
-from es_service.runs.checked_config import accepted
-from es_service.runs.resume_checks import columns, require_resumable
+from es_service.runs.checked_config import accepted, columns, require_resumable
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from es_service.cli.main import app
 from es_service.config.changes import changed_constants
 from es_service.config.keys import FIELDS, all_search_fields
-from es_service.config.loading import described_keys
 from es_service.config.resolution import default_chunk_pairs, default_gradient_block_pairs, default_rollout_block_pairs
 from es_service.config.search import PRESETS, preset_table, preset_values
 from es_service.config.text import dump_yaml, parse_value
+from es_service.config.values import described_keys
 from es_service.config.workload import config_warnings, worker_spec
 from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS, OURS

@@ -11,7 +11,7 @@ from es_service import api
 from es_service.errors import StoreError
 from es_service.loop.history import evaluated_columns
 from es_service.report.write import write_report
-from es_service.runs import resume_checks
+from es_service.runs import checked_config
 from tests.system.command_line import command
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -46,7 +46,7 @@ def test_a_run_without_the_columns_that_came_later_goes_on_and_its_page_says_wha
         return tuple(column for column in evaluated_columns(*arguments) if column.deterministic)
 
     with monkeypatch.context() as then:
-        then.setattr(resume_checks, "evaluated_columns", older)
+        then.setattr(checked_config, "evaluated_columns", older)
         api.run(given | {"budget": {"generations": 2}}, tmp_path / "older")
     resumed = api.resume(tmp_path / "older", ["budget.generations=3"]).run
     whole = api.run(given | {"budget": {"generations": 3}}, tmp_path / "newer").run

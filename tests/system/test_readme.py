@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from es_service.config.keys import FIELDS, all_search_fields, methods_with
-from es_service.config.loading import described_keys
 from es_service.config.search import preset_table
 from es_service.config.text import show
+from es_service.config.values import described_keys
 from es_service.search.algorithms import OURS
 from tests.system import warm
 

@@ -50,11 +50,11 @@ def test_columns_explained_in_other_words_are_the_same_columns(finished, tmp_pat
     """So a version may explain them better and go on with the runs of those before it."""
     from es_service import api
     from es_service.loop.history import history_columns
-    from es_service.runs import resume_checks
+    from es_service.runs import checked_config
 
     shutil.copytree(finished[0], tmp_path / "run")
     monkeypatch.setattr(
-        resume_checks,
+        checked_config,
         "history_columns",
         lambda *about: tuple(replace(at, meaning="new") for at in history_columns(*about)),
     )

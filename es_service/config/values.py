@@ -1,0 +1,141 @@
+"""What is wrong with a value by itself, and in words what is allowed; the keys of configs, described for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from types import FunctionType, NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from es_service.config.given import nested
+from es_service.config.keys import (
+    FIELDS,
+    KIND,
+    SECTIONS,
+    Methods,
+    all_search_fields,
+    methods_with,
+    parts_of,
+    search_fields,
+)
+from es_service.config.model import RunConfig
+from es_service.config.parts import TASK_OPTIONS
+from es_service.config.resolution import LEFT_OPEN, Values
+from es_service.config.search import SearchConfig, preset_rows
+from es_service.config.text import not_allowed, one_of, problem_of, show, wrong_value
+from es_service.errors import Problem
+from es_service.protocol.user_code import in_no_file
+
+
+def value_problems(
+    values: Mapping[str, Any], drafted: Values, settings: type[SearchConfig] | None, algorithms: Methods
+) -> dict[str, Problem]:
+    """Key -> problem for each value that is invalid by itself. Missing keys are not reported here, nor are options.
+
+    Args:
+        drafted: all values, of which the kinds of parts are needed.
+        settings: those of the method; None if it is not known: then those of the method that has most of the keys.
+    """
+    if settings is None:
+        known = [method.settings for method in algorithms.values()]
+        settings = max(known, key=lambda candidate: len(values.keys() & search_fields(candidate)))
+    fields, parts = FIELDS | all_search_fields(algorithms) | search_fields(settings), parts_of(settings)
+    kinds = {key: drafted.get(key, fields[key].default) for part in parts if (key := f"{part}.{KIND}")}
+    plain = {key: value for key, value in {**kinds, **values}.items() if not key.startswith(TASK_OPTIONS)}
+    sections = nested(plain)
+    wrong_keys: set[str] = set()
+    problems: dict[str, Problem] = {}
+    for model, section, mapping in ((RunConfig, (), sections), (settings, ("search",), sections.pop("search"))):
+        try:
+            model.model_validate(mapping)
+        except ValidationError as error:
+            for item in error.errors(include_url=False):
+                place = [str(component) for component in (*section, *item["loc"])]
+                if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
+                    place[2:3] = [] if len(place) > 2 else [KIND]
+                if not item["loc"]:  # a rule that the class of a user's search has
+                    problems["search"] = problem_of("search", None, item["msg"])
+                # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
+                wrong_keys |= {".".join(place[: k + 1]) for k in range(len(place))}
+    return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in wrong_keys}
+
+
+def _bad_value(name: str, value: object, field: FieldInfo) -> Problem:
+    """The problem of an invalid value: what is allowed, and how to write what was probably meant."""
+    allowed = allowed_words(field.annotation, field.metadata)
+    if name in LEFT_OPEN:
+        allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
+    choices = get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
+    if isinstance(value, type | FunctionType):
+        path = f"{value.__module__}:{value.__qualname__}"
+        return not_allowed(name, value, allowed, hint=f"; {in_no_file(path) or f'name it as text: {path}'}")
+    return wrong_value(name, value, allowed, choices)
+
+
+_PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_LIMITS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+"""Types and limits that the settings of a user's search may have without the words of `config/parts.py`."""
+
+
+def allowed_words(annotation: Any, metadata: Iterable[object] = ()) -> str:
+    """What a type allows, in words: the text in its annotation if there is one, else its literal values."""
+    for words in metadata:
+        if isinstance(words, str):
+            return words
+    if annotation in _PLAIN:
+        limits = [
+            f"{words} {getattr(limit, name):g}" for limit in metadata for name, words in _LIMITS if hasattr(limit, name)
+        ]
+        return ", ".join([_PLAIN[annotation], *limits])
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return allowed_words(parts[0], parts[1:])
+    if origin in (Union, UnionType):
+        return " or ".join(allowed_words(part) for part in parts)
+    if annotation is NoneType:
+        return "null"
+    return one_of(parts)
+
+
+class DescribedKey(NamedTuple):
+    """A key of configs, for people."""
+
+    key: str
+    default: str
+    """In YAML, both presets with a slash between, or "required"; then those of methods that have another one."""
+    allowed: str
+    """What values are allowed, in words."""
+    methods: tuple[str, ...]
+    """The methods with which it has an effect."""
+    meaning: str
+
+
+def described_keys(algorithms: Methods) -> list[DescribedKey]:
+    """All keys, in the order of the sections: those of every config, then those of methods."""
+    described = []
+    for key, field in (FIELDS | all_search_fields(algorithms)).items():
+        methods = methods_with(key, algorithms)
+        defaults: dict[str, list[str]] = {}
+        for name in methods or algorithms:
+            defaults.setdefault(_default_text(key, algorithms[name].settings), []).append(name)
+        first = max(defaults, key=lambda text: len(defaults[text]))
+        others = [f"{text} with {one_of(names, 'and')}" for text, names in defaults.items() if text != first]
+        left_open = f"{LEFT_OPEN[key]} or " if LEFT_OPEN.get(key) else ""
+        allowed = f"{left_open}{allowed_words(field.annotation, field.metadata)}"
+        described.append(DescribedKey(key, "; ".join([first, *others]), allowed, methods, field.description or ""))
+    meaning, allowed = SECTIONS["task"].model_fields["options"].description or "", "what the task declares"
+    described.append(DescribedKey(f"{TASK_OPTIONS}NAME", "the task's", allowed, tuple(algorithms), meaning))
+    sections = [*SECTIONS, *FIELDS]  # a key outside of sections is its own
+    return sorted(described, key=lambda row: sections.index(row.key.split(".")[0]))
+
+
+def _default_text(key: str, settings: type[SearchConfig]) -> str:
+    """The default of a key with a method, as text."""
+    field = (FIELDS | search_fields(settings))[key]
+    if row := {row.key: row for row in preset_rows(settings)}.get(key):
+        return " / ".join(dict.fromkeys((show(row.literature), show(row.uber))))
+    if key in LEFT_OPEN:
+        return show(LEFT_OPEN[key])
+    return "required" if field.is_required() else show(field.get_default(call_default_factory=True))
