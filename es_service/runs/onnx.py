@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.errors import ConfigError, WayOut, counted
 from es_service.protocol.machine import VERSION
-from es_service.runs.certified import Certified, measure_of
+from es_service.runs.certified import Certified, measure_of, pairs_sentence
 from es_service.runs.snapshot import Policy
 from es_service.runs.view import Run
 from es_service.store.reader import read_platforms
@@ -168,6 +168,17 @@ def model_card(run: Run, files: Sequence[str], certified: Certified | None) -> s
         )
         if row["successes"] is not None:
             lines.append(f"It succeeds in {row['successes']} of them.")
+        if certified.elsewhere is not None:
+            there, gap = (
+                "{:.6g} (95 % interval {:.6g} to {:.6g})".format(
+                    *(row[f"{prefix}_{measure}_{end}"] for end in ("mean", "low", "high"))
+                )
+                for prefix in ("elsewhere", "gap")
+            )
+            lines.append(
+                f"In `{certified.elsewhere.title}`, it has {there} in {row['elsewhere_episodes']} episodes, a gap of "
+                f"{gap} to the run's task, {pairs_sentence(paired=certified.elsewhere.paired)}."
+            )
     memory = ""
     if spec.memory:
         memory = f"memory = np.zeros((1, {spec.memory}), np.float32)  # at the start of an episode\n"

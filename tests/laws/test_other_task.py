@@ -25,6 +25,7 @@ from es_service.runs.certification import certify_run
 from es_service.runs.certified import all_certifications, certified_elsewhere, certified_policies
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.intervals import gap_interval, mean_interval, share_gap_interval
+from es_service.runs.onnx import model_card
 from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
 from es_service.runs.verification import recomputed_certifications
@@ -184,6 +185,9 @@ def test_every_reader_shows_the_other_tasks(copied, tmp_path):
     [heads, *rows] = (tmp_path / "out" / "certified.csv").read_text().splitlines()
     assert {"elsewhere", "elsewhere_return_mean", "gap_return_low"} <= {*heads.split(",")}
     assert len(rows) == 4
+    card = model_card(copied, ["certified.onnx"], elsewhere["point_maze (start = corner)"])
+    assert f"In `point_maze (start = corner)`, it has {corner['elsewhere_return_mean']:.6g} (95 % interval" in card
+    assert f"a gap of {corner['gap_return_mean']:.6g} (95 % interval" in card
     runs = Runs([copied.folder])
     [line] = [line for line in metrics(runs.summaries()).splitlines() if "gap{" in line and "corner" in line]
     assert float(line.split()[-1]) == corner["gap_return_mean"]
