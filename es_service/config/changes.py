@@ -61,7 +61,7 @@ def changed_config(
         overrides, known, name: as for `read`.
 
     Raises:
-        ConfigError: as for `load_config`.
+        ConfigError: lists every problem found, as that of `Reading.config`.
     """
     parsed = parse(source, overrides, name)
     if given is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -129,3 +130,14 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
         except ValueError as error:
             problems.append(Problem(f"{where}: {error}", name, text))
     return values, problems
+
+
+def start_of(init_from: str) -> tuple[str, str | tuple[int, ...]]:
+    """Parse `search.init_from`: (folder of a run, "centre" for the one updated last, "best", or the index of a cell).
+
+    The forms are RUN, RUN:best and RUN:3,17. If a folder has the whole text as its name, that folder is used.
+    """
+    folder, _, which = init_from.rpartition(":")
+    if not folder or os.path.isdir(init_from) or not re.fullmatch(r"best|\d+(,\d+)*", which):
+        return init_from, "centre"
+    return folder, which if which == "best" else tuple(map(int, which.split(",")))

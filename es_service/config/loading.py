@@ -35,7 +35,7 @@ from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_o
 from es_service.config.search import SearchConfig, preset_rows
 from es_service.config.tasks import Tasks, read_options, settings_of_task
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
-from es_service.config.values import value_problems
+from es_service.config.values import allowed_words, value_problems
 from es_service.errors import ConfigError, Problem, counted
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.rollouts import Rollouts
@@ -93,12 +93,12 @@ class Reading:
     @cached_property
     def idle(self) -> dict[str, str]:
         """Keys of the overrides that the method, or the chosen kind of a part, does not have; each with the name of
-        that method or kind. None if the method is not known."""
+        that method or kind. Nothing if the method is not known."""
         if self.settings is None:
             return {}
         idle = {key: str(self.values["search.algorithm"]) for key in self.wanted if not has_effect(key, self.settings)}
-        for key in self.wanted.keys() - idle.keys():
-            if lacks(key, kind := self.values.get(kind_of(key)), self.settings):
+        for key in self.wanted:
+            if key not in idle and lacks(key, kind := self.values.get(kind_of(key)), self.settings):
                 idle[key] = f"{kind_of(key)} = {show(kind)}"
         return idle
 
@@ -173,12 +173,17 @@ def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> 
     used = {key: value for key, value in used.items() if not key.startswith(TASK_OPTIONS)} | options
     invalid = {*bad, *wrong} | {key for key in FIELDS if key.split(".")[0] in unusable}
     values = Values(used, task, settings, known.rollouts, invalid)
+    missing = [
+        problem_of(key, None, f"missing; must be {allowed_words(field.annotation, field.metadata)}")
+        for key, field in values.missing.items()
+    ]
     problems = [
         *problems,
         *wrong.values(),
         *bad.values(),
         *unknown,
         *wrong_options,
+        *missing,
         *_idle_problems(idle, values, known.algorithms, task),
         *problems_of(values, (*RULES, *START_RULES) if new else RULES),
     ]

@@ -1,7 +1,7 @@
 """The resolved, frozen config of a run, and the part of it that can never change once the run exists.
 
-A `RunConfig` contains no `auto` that would affect results. Create it with `loading.load_config` and not by hand:
-`load_config` fills in presets, defaults and shapes and checks the sections against each other.
+A `RunConfig` contains no `auto` that would affect results. It is made by `loading.read` and not by hand: that fills in
+presets, defaults and shapes and checks the sections against each other.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property
 from typing import Any, cast
 
+from pydantic.fields import FieldInfo
+
 from es_service.config.keys import FIELDS, KIND, kind_of, parts_of, search_fields
 from es_service.config.parts import RESOURCES, TASK_OPTIONS
 from es_service.config.search import PRESETS, PopulationConfig, PresetRow, SearchConfig, preset_rows
@@ -116,6 +118,14 @@ class Values(Mapping[str, Any]):
     def of(self, given: Mapping[str, Any]) -> Values:
         """Values of a config with the same task and method that gives other ones."""
         return Values(given, self._task, self._settings, self.rollouts)
+
+    @property
+    def missing(self) -> dict[str, FieldInfo]:
+        """Keys to which the config gives no value and the method neither a default nor a preset, with their fields."""
+        fields = {} if self._settings is None else search_fields(self._settings)
+        required = {key: its for key, its in fields.items() if its.is_required() and kind_of(key) not in fields}
+        found = {*self._presets, *DEFAULTS, *self._invalid, *self.given}
+        return {key: its for key, its in required.items() if key not in found}
 
     def known(self) -> dict[str, Any]:
         """All values that can be found, by key."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from es_service.config.given import start_of
 from es_service.config.keys import BUDGET, FIELDS
 from es_service.config.parts import RESOURCES, TASK_OPTIONS, counts
 from es_service.config.resolution import Unknown, Values, only_centres
@@ -270,17 +270,6 @@ def start_exists(config: Values, task: TaskSpec) -> Problems:
     if what:
         allowed = "the folder of another run, with :best or a cell as :3,17 after it if wanted, or null"
         yield problem_of("search.init_from", start, f"{folder} {what}; must be {allowed}", allowed=allowed)
-
-
-def start_of(init_from: str) -> tuple[str, str | tuple[int, ...]]:
-    """Parse `search.init_from`: (folder of a run, "centre" for the one updated last, "best", or the index of a cell).
-
-    The forms are RUN, RUN:best and RUN:3,17. If a folder has the whole text as its name, that folder is used.
-    """
-    folder, _, which = init_from.rpartition(":")
-    if not folder or os.path.isdir(init_from) or not re.fullmatch(r"best|\d+(,\d+)*", which):
-        return init_from, "centre"
-    return folder, which if which == "best" else tuple(map(int, which.split(",")))
 
 
 # Shapes of the work, and where it runs

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from es_service.config.changes import START_KEYS, does_not_fit, start_afresh
-from es_service.config.given import Overrides, parse_overrides
+from es_service.config.given import Overrides, parse_overrides, start_of
 from es_service.config.model import RunConfig
 from es_service.config.parts import TargetObjective
-from es_service.config.rules import start_of
 from es_service.config.search import CandidatesConfig
 from es_service.config.tasks import task_of
 from es_service.config.text import show

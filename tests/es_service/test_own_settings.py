@@ -106,6 +106,12 @@ def test_a_wrong_value_is_one_line_with_what_is_allowed(own, given, message):
     assert problems(own, f"search.{given}") == [f"search.{given.split('=')[0]}: {message}"]
 
 
+def test_a_key_without_a_default_must_be_given(own, tmp_path):
+    (tmp_path / "kinds_of_keys.py").write_text(KINDS_OF_KEYS.replace("fast: bool = False", "fast: bool"))
+    assert problems(own, "seed=-1")[1:] == ["search.fast: missing; must be true or false"]
+    assert api.load_config(own, ["search.fast=true"]).search.model_dump()["fast"]
+
+
 def test_a_search_that_declares_nothing_has_the_keys_of_methods_with_several_centres(own):
     source = own | {"search": {"algorithm": "kinds_of_keys:plain"}}
     config = api.load_config(source, ["search.update=all", "search.centres=3", "search.step.kind=plain"])
