@@ -37,6 +37,8 @@ PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
+MODELS, MODEL_FILES = "mujoco", "envs/mujoco/assets"
+"""Kind of the tasks whose models are files of this library, and the folder of its package that contains them."""
 NAMED = 5
 """Names of files in a sentence."""
 SHARED_FOLDERS = ("site-packages", "dist-packages")
@@ -75,7 +77,17 @@ def user_sources(*names: str) -> dict[str, str]:
         if name.startswith(f"{LIBRARY}:"):
             with suppress(metadata.PackageNotFoundError):  # its version, in the place of the hash of its files
                 sources[LIBRARY] = metadata.version(LIBRARY)
+        if name.startswith(f"{MODELS}:"):
+            sources |= _models()
     return sources
+
+
+def _models() -> dict[str, str]:
+    """Files of the models of Gymnasium's MuJoCo; a host may have another version of the package."""
+    spec = importlib.util.find_spec(LIBRARY)
+    folders = [Path(folder) / MODEL_FILES for folder in (spec and spec.submodule_search_locations) or ()]
+    files = (file for folder in folders for file in sorted(folder.glob("*.xml")))
+    return {f"{LIBRARY}/{MODEL_FILES}/{file.name}": sha256(file.read_bytes()) for file in files}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
