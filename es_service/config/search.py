@@ -67,13 +67,6 @@ def preset_rows(settings: type[Any]) -> list[PresetRow]:
     return [row for above in reversed(settings.__mro__) for row in vars(above).get("presets", ())]
 
 
-def preset_values(preset: str, settings: type[Any]) -> dict[str, object]:
-    """Values of one preset for a method with these settings: dotted key -> value. Raises KeyError if it is unknown."""
-    if preset not in PRESETS:
-        raise KeyError(preset)
-    return {row.key: getattr(row, preset) for row in preset_rows(settings)}
-
-
 def preset_table(algorithms: Mapping[str, Any]) -> list[PresetRow]:
     """Rows of all methods, for documentation: those for several methods first."""
     rows: dict[int, PresetRow] = {}

@@ -16,7 +16,7 @@ from es_service.cli.main import app
 from es_service.config.changes import changed_constants
 from es_service.config.keys import FIELDS, all_search_fields
 from es_service.config.resolution import default_chunk_pairs, default_gradient_block_pairs, default_rollout_block_pairs
-from es_service.config.search import PRESETS, preset_table, preset_values
+from es_service.config.search import PRESETS, preset_rows, preset_table
 from es_service.config.text import dump_yaml, parse_value
 from es_service.config.values import described_keys
 from es_service.config.workload import config_warnings, worker_spec
@@ -68,7 +68,7 @@ def test_preset_table_has_a_source_for_every_row_and_differs_in_each():
     for preset in PRESETS:
         for name, method in OURS.items():
             rows = {row.key: getattr(row, preset) for row in table if row.method in (None, name)}
-            values = preset_values(preset, method.settings)
+            values = {row.key: getattr(row, preset) for row in preset_rows(method.settings)}
             assert values == {key: rows[key] for key in values}
             assert {row.key for row in table if row.method == name} <= values.keys()
         assert load(MINIMAL, f"search.preset={preset}").search.preset == preset
