@@ -83,13 +83,14 @@ def _whole(shape: tuple[int, ...], parts: Sequence[EpisodesResult]) -> EpisodesR
 
 def _traces(episodes: int, first: int, parts: Sequence[EpisodesResult]) -> NDArray:
     """Traces of the first episodes, [N, T, B]: those of a centre are [T, B] in each chunk."""
-    traces: dict[int, NDArray] = {}
+    rows, traces = [], []
     for part in parts:
         assert part.row_N is not None
-        first_rows = part.row_N[(part.row_N - first) % episodes == 0].tolist()
-        if part.trace_T_B is not None:
-            traces |= zip(first_rows, part.trace_T_B.reshape(-1, *part.trace_T_B.shape[-2:]), strict=False)
-    return np.stack([traces[row] for row in sorted(traces)])
+        first_rows = part.row_N[(part.row_N - first) % episodes == 0]
+        if part.trace_T_B is not None and first_rows.size:
+            rows.append(first_rows)
+            traces.append(part.trace_T_B.reshape(-1, *part.trace_T_B.shape[-2:]))
+    return np.concatenate(traces)[np.argsort(np.concatenate(rows))]
 
 
 def _ranges(first_N: NDArray[np.int64], count_N: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -2,11 +2,13 @@
 
     python -m tests.benchmarks.generation_time [--task point_maze] [--algorithm es] [--engine inline ray]
     python -m tests.benchmarks.generation_time --emitters 1 16      # ME-ES, 64 pairs for each emitter
+    python -m tests.benchmarks.generation_time --driver             # the driver's own time, without rollouts
 
 Two workers; PointMaze with 64, 512 and 4,096 pairs, ants with 64 and 5,000; medians over the generations, but for the
 first ten if there are more; the engines take turns. Memory is that of this process and everything it started, shared
 pages divided among those who share them. With --emitters each run is followed by a measurement of what rollouts alone
-make on the same cores (`es-service bench rollouts`), and its rate is also given as a share of that.
+make on the same cores (`es-service bench rollouts`), and its rate is also given as a share of that. With --driver,
+episodes have five steps, so that the workers do little; what counts is the processor time of the driver's process.
 """
 
 from __future__ import annotations
@@ -25,6 +27,15 @@ from es_service.cli.bench_rollouts import bench_rollouts
 POINT_MAZE_SIZES = ((64, 500), (512, 150), (4096, 40))
 ANT_SIZES = ((64, 20), (5000, 1))
 """(pairs, generations)."""
+DRIVER = {
+    "MAP-Elites, 64": ("map_elites", {"batch": 64}),
+    "MAP-Elites, 256": ("map_elites", {"batch": 256}),
+    "ME-ES, 64 pairs": ("me_es", {"pairs": 64}),
+    "ES, 64 pairs": ("es", {"pairs": 64}),
+}
+"""Cases of --driver: name -> (algorithm, its settings)."""
+FIRST, LAST = 10, 210
+"""Generations between which --driver measures."""
 PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
 
@@ -100,14 +111,39 @@ def measure(
     }
 
 
+def driver_ms(algorithm: str, settings: dict[str, int], folder: Path) -> float:
+    """Processor time of the driver's process for a generation, in milliseconds."""
+    config = api.load_config(
+        {
+            "task": {"environment": "point_maze", "episode_steps": 5},
+            "search": {"algorithm": algorithm, **settings},
+            "budget": {"generations": LAST},
+            "compute": {"workers": 2, "engine": "inline"},
+        }
+    )
+    at: dict[int, float] = {}
+
+    def look(row) -> None:
+        if row["generation"] in (FIRST, LAST):
+            at[row["generation"]] = time.process_time()
+
+    api.run(config, folder, on_generation=look)
+    return round((at[LAST] - at[FIRST]) * 1000 / (LAST - FIRST), 2)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", default="point_maze")
     parser.add_argument("--algorithm", default="es")
     parser.add_argument("--engine", nargs="+", default=["inline", "ray"])
     parser.add_argument("--emitters", nargs="*", type=int, default=[])
+    parser.add_argument("--driver", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
+        for name, case in DRIVER.items() if arguments.driver else ():
+            print(json.dumps({"case": name, "driver_ms": driver_ms(*case, Path(folder) / name)}), flush=True)
+        if arguments.driver:
+            return
         sizes = POINT_MAZE_SIZES if arguments.task == "point_maze" else ANT_SIZES
         for emitters, engine in itertools.product(arguments.emitters, arguments.engine):
             generations = 300 // emitters + 20 if arguments.task == "point_maze" else 3
