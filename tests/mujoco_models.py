@@ -9,12 +9,15 @@ from __future__ import annotations
 import copy
 import importlib.util
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
+from workers.environments.c_mujoco import CStep, c_step, one_ulp, quantiles, relative_error
 from workers.environments.mujoco_parts import MjModel, MujocoState, mujoco
+
+__all__ = ["CStep", "c_step", "one_ulp", "quantiles", "relative_error"]
 
 BRAX, GYMNASIUM = "brax/envs/assets", "gymnasium/envs/mujoco/assets"
 PLAYGROUND = "mujoco_playground/_src/dm_control_suite/xmls"
@@ -40,8 +43,6 @@ OF_GYMNASIUM = {
 }
 """Name -> (file, substeps of a control step, the `frame_skip` of Gymnasium's environments)."""
 SWIMMER_LINKS = 6
-MOST_DEPTH = 0.03
-"""Metres; see `CStep.comparable`."""
 
 
 class Example(NamedTuple):
@@ -51,24 +52,6 @@ class Example(NamedTuple):
     substeps: int
     note: str = ""
     """What is not as its authors set it."""
-
-
-class CStep(NamedTuple):
-    """One control step of many states in C MuJoCo, float64."""
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    contacts: np.ndarray
-    """[N] most contacts in one of the substeps."""
-    deepest: np.ndarray
-    """[N] greatest depth of a contact in one of the substeps, in metres."""
-    is_valid: np.ndarray
-    """[N] whether C MuJoCo has not found the step unstable. It starts again from `qpos0` then; MJX does not."""
-
-    def comparable(self) -> np.ndarray:
-        """[N] whether the step is a truth to compare with: stable, and no contact as deep as only bodies that have gone
-        through each other have, where the axes of capsules cross and the direction of the force is arbitrary."""
-        return self.is_valid & (self.deepest < MOST_DEPTH)
 
 
 def folder_of(name: str, near: Path | None = None) -> Path | None:
@@ -187,41 +170,3 @@ def c_states(model: MjModel, substeps: int, count: int, seed: int = 0, most_step
                 data.qvel[model.jnt_dofadr[j]] = way * abs(rng.normal(0.0, 1.0))
         rows.append((data.qpos.copy(), data.qvel.copy(), data.act.copy(), data.qacc_warmstart.copy(), data.time))
     return MujocoState(*(np.array(part, np.float32) for part in zip(*rows, strict=True)))
-
-
-def c_step(model: MjModel, substeps: int, states: MujocoState, ctrl: np.ndarray) -> CStep:
-    """One control step of each state [N] with controls [N, nu] in C MuJoCo."""
-    data, rows = mujoco.MjData(model), []
-    for qpos, qvel, act, warmstart, time, u in zip(*states, ctrl, strict=True):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.act[:], data.qacc_warmstart[:] = qpos, qvel, act, warmstart
-        data.time, data.ctrl[:] = time, u
-        contacts, deepest = 0, 0.0
-        for _ in range(substeps):
-            mujoco.mj_step(model, data)
-            contacts = max(contacts, data.ncon)
-            deepest = max(deepest, *(-contact.dist for contact in data.contact)) if data.ncon else deepest
-        is_valid = not any(warning.number for warning in data.warning)
-        rows.append((data.qpos.copy(), data.qvel.copy(), contacts, deepest, is_valid))
-    return CStep(*(np.array(part) for part in zip(*rows, strict=True)))
-
-
-def relative_error(of: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """[N] greatest error of a row, divided by the greatest entry of the right row, or by 1 if that is greater."""
-    return np.abs(of - to).max(axis=1) / np.maximum(np.abs(to).max(axis=1), 1.0)
-
-
-def quantiles(errors: np.ndarray) -> dict[str, Any]:
-    """Number, median, 99 % and greatest of errors; NaN if there are none."""
-    values = [float(np.quantile(errors, q)) if len(errors) else float("nan") for q in (0.5, 0.99, 1.0)]
-    return dict(zip(("states", "median", "p99", "max"), (len(errors), *values), strict=True))
-
-
-def one_ulp(states: MujocoState, seed: int = 0) -> MujocoState:
-    """The states with positions and velocities moved by one float32 ulp, up or down at random."""
-    rng = np.random.default_rng(seed)
-
-    def moved(array: np.ndarray) -> np.ndarray:
-        return np.nextafter(array, np.where(rng.random(array.shape) < 0.5, np.inf, -np.inf).astype(np.float32))
-
-    return states._replace(qpos=moved(states.qpos), qvel=moved(states.qvel))

@@ -23,6 +23,7 @@ from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 from es_service.protocol.system import architecture
 
@@ -73,7 +74,9 @@ def user_sources(*names: str) -> dict[str, str]:
     sources: dict[str, str] = {}
     for name in names:
         if own := user_path(name):
-            sources |= {module.source: module.sha256 for module in modules_of(own).user.values()}
+            modules = modules_of(own)
+            sources |= {module.source: module.sha256 for module in modules.user.values()}
+            sources |= {source: sha256(file.read_bytes()) for source, file in modules.models.items()}
         if name.startswith(f"{LIBRARY}:"):
             with suppress(metadata.PackageNotFoundError):  # its version, in the place of the hash of its files
                 sources[LIBRARY] = metadata.version(LIBRARY)
@@ -184,6 +187,9 @@ class Modules(NamedTuple):
     """Top packages outside the standard library that these files import from other places."""
     is_installed: bool
     """Whether they are a package that is installed beside those of other projects."""
+    models: Mapping[str, Path]
+    """Name in `Sources` -> file of a model of MuJoCo that a string of these modules names, or that such a model reads:
+    included files, meshes, textures."""
 
 
 def modules_of(path: str) -> Modules:
@@ -191,14 +197,16 @@ def modules_of(path: str) -> Modules:
 
     Nothing is imported, so that the driver need not load what only the workers use: the modules are found by the import
     statements. The same place is the top package, and the folder that contains it, unless packages of several projects
-    are installed there. Other packages count by their versions, if at all.
+    are installed there. Other packages count by their versions, if at all. A file of MuJoCo (MJCF) counts if a string
+    in a module names it, relative to the module's folder.
     """
     name = path.partition(":")[0]
     top = _find(name.partition(".")[0], None)
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
-        return Modules({}, frozenset(), is_installed=False)
+        return Modules({}, frozenset(), is_installed=False, models={})
     is_shared = os.path.basename(place) in SHARED_FOLDERS
     modules: dict[str, UserModule] = {}
+    models: dict[str, Path] = {}
     others: set[str] = set()
     seen: set[str] = set()
     wanted = [name]
@@ -218,10 +226,12 @@ def modules_of(path: str) -> Modules:
             content, package = file.read_bytes(), spec.name if is_package else spec.name.rpartition(".")[0]
             needs = _imports(content, package) if file.suffix == ".py" else ()
             wanted += needs
+            for model in _named_models(content, file.parent) if file.suffix == ".py" else ():
+                models |= {_beside(source, os.path.relpath(read, file.parent)): read for read in model_files(model)}
             parts = spec.name.split(".")
             above = (".".join(parts[:count]) for count in range(1, len(parts)))
             modules[spec.name] = UserModule(file, source, sha256(content), frozenset((*needs, *above)))
-    return Modules(modules, frozenset(others - sys.stdlib_module_names), is_shared)
+    return Modules(modules, frozenset(others - sys.stdlib_module_names), is_shared, models)
 
 
 def _chain(name: str) -> Iterator[importlib.machinery.ModuleSpec]:
@@ -261,15 +271,58 @@ def _place(spec: importlib.machinery.ModuleSpec) -> str:
     return str(Path(os.path.abspath(own)).parents[spec.name.count(".")])
 
 
+def model_files(model: Path) -> list[Path]:
+    """The files that MuJoCo reads for a model in MJCF: itself, what it includes, meshes, textures; those that exist.
+
+    A file that is not read as XML names no others; MuJoCo says what is wrong with it.
+    """
+    found, folders = [model], {model.parent: None}
+    for file in found:
+        try:
+            elements = list(ElementTree.fromstring(file.read_bytes()).iter()) if file.suffix == ".xml" else []
+        except ElementTree.ParseError:
+            elements = []
+        named = [element.get(f"{kind}dir") for element in elements for kind in ("mesh", "texture", "asset")]
+        folders |= {model.parent / name: None for name in named if name}
+        read = [value for element in elements for key, value in element.items() if key.startswith("file")]
+        places = (Path(os.path.normpath(folder / name)) for name in read for folder in folders)
+        found += dict.fromkeys(place for place in places if place.is_file() and place not in found)
+    return found
+
+
+def _beside(source: str, relative: str) -> str:
+    """Name in `Sources` of a file relative to the folder of another; only its own name if it is outside of the place
+    of the user's modules."""
+    name = os.path.normpath(os.path.join(os.path.dirname(source), relative))
+    return os.path.basename(name) if name.startswith((os.pardir, os.sep)) else name
+
+
+def _named_models(content: bytes, folder: Path) -> list[Path]:
+    """Files of MuJoCo that strings of a source file name, relative to its folder."""
+    files = (Path(os.path.normpath(folder / name)) for name in _names_of_xml(content))
+    return [file for file in files if file.is_file()]
+
+
+@lru_cache(maxsize=1024)
+def _names_of_xml(content: bytes) -> tuple[str, ...]:
+    """Strings of a source file that may name a file of MuJoCo."""
+    texts = (node.value for node in ast.walk(_tree(content)) if isinstance(node, ast.Constant))
+    return tuple(text for text in texts if isinstance(text, str) and text.endswith(".xml") and text.isprintable())
+
+
+def _tree(content: bytes) -> ast.Module:
+    """The syntax tree of a source file; an empty one if it has errors, since its import is going to fail."""
+    try:
+        return ast.parse(content)
+    except (SyntaxError, ValueError):
+        return ast.Module([], [])
+
+
 @lru_cache(maxsize=1024)
 def _imports(content: bytes, package: str) -> tuple[str, ...]:
     """Names of the modules that a source file may import, also inside its functions."""
-    try:
-        tree = ast.parse(content)
-    except (SyntaxError, ValueError):
-        return ()  # its import is going to fail
     names: list[str] = []
-    for node in ast.walk(tree):
+    for node in ast.walk(_tree(content)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

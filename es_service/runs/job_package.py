@@ -2,7 +2,7 @@
 
 A job's folder is on every node, and Python finds modules there before all others, so the driver and the workers compute
 with the files that were sent. They are the files whose hashes are recorded with a run, and no others: packages that are
-installed here must be installed there, and data files that a module reads must be there.
+installed here must be installed there, and data files that a module reads must be there, but for MuJoCo's models.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _package(command: Sequence[str], out: str, text: str, configs: Sequence[RunC
         if modules.is_installed:
             expected.add(path.partition(":")[0].partition(".")[0])
         else:
-            files |= {module.source: module.file for module in modules.user.values()}
+            files |= {module.source: module.file for module in modules.user.values()} | dict(modules.models)
             expected |= modules.others
     return JobPackage(
         (*command, "--out", out), out, text, dict(sorted(files.items())), tuple(sorted(expected - set(PACKAGES)))

@@ -15,6 +15,7 @@ from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, meant_environment
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
+    from workers.environments.c_mujoco import ControlStep
     from workers.environments.function_task import FunctionTask
     from workers.environments.host_task import HostTask
 
@@ -110,6 +111,8 @@ class Environment:
     compiles_drawn_resets: bool = False
     """Whether simd may compile a reset that draws by `jax.random`. JAX computes it if not, as it always has for Brax's
     environments and for tasks of users, so that their runs keep their bits."""
+    control_step: ControlStep | None = None
+    """What a step is to C MuJoCo, with which `doctor` compares it; None if it has no model of MuJoCo."""
 
 
 def make_environment(name: str, options: Mapping[str, Any]) -> Environment:

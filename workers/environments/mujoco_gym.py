@@ -23,6 +23,7 @@ from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.options import Option, OptionValue, choice
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import quietly
+from workers.environments.c_mujoco import ControlStep
 from workers.environments.gymnasium_task import gymnasium_package
 from workers.environments.host_task import action_bounds
 from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, GymState, GymTask, Parts, Simulated
@@ -101,8 +102,11 @@ def make(
     def reset(key: Any) -> GymState:
         return of.at(*parts.start(key))
 
+    def ctrl(action: Any) -> Any:
+        return jnp.clip(middle_A + half_A * action, low_A, high_A)
+
     def step(state: GymState, action: Any) -> tuple[GymState, Any, Any]:
-        bounded_A = jnp.clip(middle_A + half_A * action, low_A, high_A)
+        bounded_A = ctrl(action)
         after = GymState(*step_and_look(mx, state.physics, bounded_A, substeps, lambda data: parts.look(data, True)))
         return after, *parts.outcome(state, after, bounded_A)
 
@@ -113,6 +117,7 @@ def make(
         lambda state: state.physics.qpos[places],
         lambda state: jnp.float32(jnp.nan),
         viewer=mujoco_viewer(model, mx, step_s, lambda state: state.physics),
+        control_step=ControlStep(model, substeps, lambda state: state.physics, ctrl),
     )
 
 

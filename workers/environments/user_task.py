@@ -12,7 +12,7 @@
         def step(self, state, action): ... # -> (state, reward, done)
         def descriptor(self, state): ...   # -> descriptor [len(descriptor_names)] of an episode that ends here
 
-It may also have:
+A class with a model of MuJoCo has less to say, see `mujoco_task.py`. It may also have:
 
 - `goal_distance(self, state)`: the distance to a goal;
 - `success(self, state, before)`: whether an episode that ends in this state has succeeded; `before` is the answer for
@@ -41,7 +41,8 @@ Observations are summed in float32, so their mean must be less than a thousand s
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -98,16 +99,16 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
         TaskError: the class cannot be imported, or its attributes or methods are missing or wrong.
     """
     task = import_named(path)
+    if has_model(task):
+        from workers.environments import mujoco_task
+
+        return mujoco_task.describe(path, task, given)
     lists = "workers/environments/user_task.py lists what a task must have"
     if missing := missing_names(task, (*ATTRIBUTES, *METHODS), lists):
         is_simulator = all(hasattr(task, name) for name in ("reset", "step")) and not hasattr(task, "observe")
         hint = f"; if it simulates in Python, did you mean python:{path}?" if is_simulator else ""
         raise TaskError(f"{path}{missing}{hint}")
-    wrong = [
-        f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
-        for name, type_ in ATTRIBUTES.items()
-        if not isinstance(getattr(task, name), type_)
-    ]
+    wrong = wrong_types(task, ATTRIBUTES)
     wrong += [
         f"{name} = {value!r} has no effect on a task in JAX: {instead}, and remove the attribute"
         for name, instead in OF_PYTHON_TASKS.items()
@@ -125,10 +126,35 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
     return replace(spec, notes=unknown_attributes(path, task, KNOWN))
 
 
+def has_model(task: Any) -> bool:
+    """Whether a class has a model of MuJoCo in the place of steps of its own (`mujoco_task.py`)."""
+    return not hasattr(task, "step") and (hasattr(task, "model") or hasattr(task, "frame_skip"))
+
+
+def wrong_types(task: Any, attributes: Mapping[str, type]) -> list[str]:
+    """Attributes of a class that are not of these types, in sentences."""
+    return [
+        f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
+        for name, type_ in attributes.items()
+        if not isinstance(getattr(task, name), type_)
+    ]
+
+
+@contextmanager
+def tracing(path: str) -> Iterator[None]:
+    """Context manager in which what a user's class raises becomes a TaskError with the task's name."""
+    try:
+        yield
+    except TaskError as error:
+        raise TaskError(f"{path}: {error}") from error.__cause__
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{path} cannot be traced by JAX: {raised(error, path)}") from error
+
+
 def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
     """Raise TaskError if methods return shapes other than the class declares, or cannot be traced."""
     task = import_named(path)
-    try:
+    with tracing(path):
         environment = make(path, options)
         state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
         action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
@@ -141,10 +167,6 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
             "goal_distance": (_shape("goal_distance", environment.goal_distance, state), ()),
             "success": (_shape("success", environment.success, state, jax.ShapeDtypeStruct((), bool)), ()),
         }
-    except TaskError as error:
-        raise TaskError(f"{path}: {error}") from error.__cause__
-    except Exception as error:  # the user's code can raise anything
-        raise TaskError(f"{path} cannot be traced by JAX: {raised(error, path)}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in shapes.items() if is_ != should]
     arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state, after)]
     if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
@@ -157,11 +179,11 @@ def _shape(name: str, method: Callable[..., Any], *arguments: Any) -> tuple[int,
     """Shape of the array that a method returns. Raises TaskError if it returns something else."""
     result = jax.eval_shape(method, *arguments)
     if not hasattr(result, "shape"):
-        raise TaskError(f"{name} returned {_shown(result)}; it must return one array")
+        raise TaskError(f"{name} returned {shown(result)}; it must return one array")
     return result.shape
 
 
-def _shown(result: Any) -> str:
+def shown(result: Any) -> str:
     """What a method has returned, in a message: the structure, since the numbers are not known while JAX traces."""
     if result is None:
         return "None (is a `return` missing?)"
@@ -171,6 +193,10 @@ def _shown(result: Any) -> str:
 def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     """Functions of a user's class, constructed with the task's options."""
     kind = import_named(path)
+    if has_model(kind):
+        from workers.environments import mujoco_task
+
+        return mujoco_task.make(path, kind, options)
     task = construct(kind, options)
     for name in (*ATTRIBUTES, "walls", "wall_clearance", "goal", "least_reward", "final_fitness"):
         of_class, of_instance = getattr(kind, name, None), getattr(task, name, None)
@@ -186,15 +212,15 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
         try:
             state, reward, done = result
         except (TypeError, ValueError):
-            raise TaskError(f"step returned {_shown(result)}; it must return (state, reward, done)") from None
+            raise TaskError(f"step returned {shown(result)}; it must return (state, reward, done)") from None
         if reward is None or done is None:
-            raise TaskError(f"step returned {_shown(result)}; its reward and done must not be None")
+            raise TaskError(f"step returned {shown(result)}; its reward and done must not be None")
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
     def observe(state: Any) -> Any:
         observation = task.observe(state)
         if observation is None:
-            raise TaskError(f"observe returned {_shown(None)}; it must return one array")
+            raise TaskError(f"observe returned {shown(None)}; it must return one array")
         return jnp.asarray(observation, jnp.float32)
 
     def reset(key: Any) -> Any:

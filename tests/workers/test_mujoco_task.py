@@ -1,0 +1,185 @@
+"""A user's class with a model of MuJoCo is a task; what is wrong with it is named. Oracle: C MuJoCo."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from es_service.protocol.errors import TaskError
+from es_service.protocol.sources import modules_of, user_sources
+from workers.environments import describe_environment, make_environment
+from workers.environments.mujoco_parts import mujoco
+
+ARM = "tests.examples.reaching_arm:ReachingArm"
+XML = """<mujoco><option timestep="0.01"/><worldbody><body><joint type="slide" axis="1 0 0"/><geom size="0.1"/>
+<site name="tip" pos="0.5 0 0"/></body></worldbody><actuator><motor ctrlrange="-2 4" gear="50" joint="{joint}"/></actuator>
+<sensor><jointpos joint="{joint}"/></sensor></mujoco>"""
+XML = XML.replace('<joint type="slide"', '<joint name="{joint}" type="slide"').replace("{joint}", "x")
+
+
+class Slider:
+    """A cart slides."""
+
+    model = XML
+    frame_skip, episode_steps = 5, 20
+    descriptor_names, descriptor_bounds = ("x",), ((-1.0, 1.0),)
+
+    def reward(self, data, earlier):
+        return data.sensordata[0] - earlier.qpos[0] + 0.0 * data.ctrl[0]
+
+    def done(self, data):
+        return data.qpos[0] > 0.1
+
+    def descriptor(self, data):
+        return data.site_xpos[self.mj_model.site("tip").id, :1]
+
+    def success(self, data, before):
+        """It has been beyond 0.05."""
+        return before | (data.qpos[0] > 0.05)
+
+
+@pytest.mark.slow
+def test_a_control_step_is_that_of_c_mujoco():
+    """Also bounds of actuators, sensors and sites of the state after it, the data before it, and the end."""
+    environment = make_environment(f"{__name__}:Slider", {})
+    state = jax.jit(environment.reset)(jnp.zeros(4, jnp.uint32))
+    np.testing.assert_array_equal(environment.observe(state), [0.0, 0.0])
+    model = mujoco.MjModel.from_xml_string(XML)
+    data, step = mujoco.MjData(model), jax.jit(environment.step)
+    for action in (0.5, 1.0, 7.0):
+        x = data.qpos[0]
+        data.ctrl[:] = min(1.0 + 3.0 * action, 4.0)
+        mujoco.mj_step(model, data, 5)
+        mujoco.mj_forward(model, data)
+        state, reward, done = step(state, jnp.array([action], jnp.float32))
+        np.testing.assert_allclose(environment.observe(state), [data.qpos[0], data.qvel[0]], rtol=1e-5)
+        np.testing.assert_allclose(environment.descriptor(state), data.site_xpos[0, :1], rtol=1e-5)
+        np.testing.assert_allclose(reward, data.sensordata[0] - x, rtol=1e-4)
+        assert bool(done) == (data.qpos[0] > 0.1)
+        beyond = data.qpos[0] > 0.05
+        assert [bool(environment.success(state, jnp.bool_(before))) for before in (False, True)] == [beyond, True]
+    assert bool(done)
+
+
+class NoReward:
+    """Lacks what it needs."""
+
+    model, frame_skip, episode_steps = XML, 5, 20
+    descriptor_names, descriptor_bounds = ("x",), ((-1.0, 1.0),)
+
+    def descriptor(self, data):
+        return data.qpos
+
+
+class WideReward(Slider):
+    def reward(self, data):
+        return data.qpos
+
+
+class TwoDescriptors(Slider):
+    def descriptor(self, data):
+        return data.site_xpos[0]
+
+
+class Nothing(Slider):
+    def descriptor(self, data):
+        pass
+
+
+class ShortReset(Slider):
+    def reset(self, key):
+        return jnp.zeros(2), jnp.zeros(1)
+
+
+class BrokenXml(Slider):
+    model = "<mujoco><worldbody><body><geom siz='0.1'/></body></worldbody></mujoco>"
+
+
+class NoFile(Slider):
+    model = "slider.xml"
+
+
+class OtherSolver(Slider):
+    model = XML.replace('timestep="0.01"', 'timestep="0.01" solver="PGS"')
+
+
+class NoFrames(Slider):
+    frame_skip = 0
+
+
+@pytest.mark.parametrize(
+    ("name", "sentences"),
+    [
+        ("NoReward", ["has no reward; workers/environments/mujoco_task.py lists"]),
+        ("WideReward", ["reward returned an array of the shape (1,); it must be ()"]),
+        ("TwoDescriptors", ["descriptor returned an array of the shape (3,); it must be (1,)"]),
+        ("Nothing", ["descriptor returned None (is a `return` missing?)"]),
+        ("ShortReset", ["reset returned positions of the shape (2,); must be (1,), the nq of the model"]),
+        ("BrokenXml", ["MuJoCo cannot read its XML: ", "unrecognized attribute: 'siz'", "line 1"]),
+        ("NoFile", ["model = 'slider.xml': there is no file ", "relative to the folder of the class"]),
+        ("OtherSolver", ["MJX lacks parts of this MuJoCo model: option solver = pgs; must be "]),
+        ("NoFrames", ["frame_skip = 0 is not positive"]),
+    ],
+)
+def test_what_is_wrong_is_named(name, sentences):
+    with pytest.raises(TaskError) as raised:
+        describe_environment(f"{__name__}:{name}")
+    assert str(raised.value).startswith(f"{__name__}:{name}")
+    for sentence in sentences:
+        assert sentence in str(raised.value)
+
+
+FILES = {
+    "robots/slide.py": """
+        from tests.workers.test_mujoco_task import Slider
+        class Slide(Slider):
+            model = "models/slide.xml"
+        class Hidden(Slider):
+            model = "models/" + "hid" + "den.x" + "ml"
+        """,
+    "robots/models/slide.xml": '<mujoco><compiler meshdir="m"/><include file="part.xml"/></mujoco>',
+    "robots/models/hidden.xml": XML,
+    "robots/models/part.xml": XML.replace("<worldbody>", '<asset><mesh name="t" file="t.obj"/></asset><worldbody>')
+    .replace("<mujoco>", "<mujocoinclude>")
+    .replace("</mujoco>", "</mujocoinclude>"),
+    "robots/models/m/t.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n",
+}
+
+
+def test_the_files_of_a_model_are_code(tmp_path, monkeypatch):
+    """What it includes and its meshes, too; a file that no string names is refused."""
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(textwrap.dedent(text))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    task = describe_environment("robots.slide:Slide")
+    assert (task.observation_size, task.action_size) == (2, 1)
+    before = user_sources("robots.slide:Slide")
+    models = {name for name in FILES if name.endswith((".xml", ".obj")) and "hidden" not in name}
+    assert before.keys() == {"robots/slide.py", *models}
+    assert modules_of("robots.slide:Slide").models == {name: tmp_path / name for name in models}
+    for name in models:
+        (tmp_path / name).write_text((tmp_path / name).read_text() + "\n")
+        after = user_sources("robots.slide:Slide")
+        assert {source for source in after if after[source] != before[source]} == {name}
+        before = after
+    with pytest.raises(TaskError, match=r"hidden.xml would be no part of the run's identity.*model = \"hidden.xml\""):
+        describe_environment("robots.slide:Hidden")
+    for module in ("robots", "robots.slide"):
+        sys.modules.pop(module, None)
+
+
+@pytest.mark.slow
+def test_the_arm_of_the_examples_reaches_its_target_in_its_model():
+    """Its positions and the place of its hand are those of C MuJoCo; its reset heeds its option."""
+    environment = make_environment(ARM, {"noise": 0.0})
+    state = jax.jit(environment.reset)(jnp.arange(4, dtype=jnp.uint32))
+    np.testing.assert_allclose(environment.descriptor(state), [0.0, -0.8], atol=1e-6)
+    np.testing.assert_allclose(environment.goal_distance(state), np.hypot(0.55, 0.82), rtol=1e-5)
+    assert not bool(environment.success(state, jnp.bool_(True)))
+    assert "tests/examples/reaching_arm.xml" in user_sources(ARM)
