@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from es_service.config.tasks import TASKS
 from es_service.config.text import did_you_mean_task, one_of
@@ -13,6 +14,8 @@ from es_service.runs.repeating import compared, examined
 
 SECONDS = 1.0
 """Duration of the measurement."""
+FAR_FROM_C = 1e-3
+"""Relative error of velocities after one control step above which the physics is another one."""
 
 
 def task_findings(name: str) -> Iterator[Finding]:
@@ -37,6 +40,8 @@ def task_findings(name: str) -> Iterator[Finding]:
         yield "note", note
     for rollout, where in task.hidden.items():
         yield "FAIL", f"{where}; {rollout} computes 0 for such a product, so no run would notice"
+    for rollout, why in task.unsupported.items():
+        yield "note", f"{rollout} cannot compute it, so compute.rollout: auto is another: {why}"
     if task.kind == "jax":
         yield "ok", "its steps are pure functions that JAX traces, so they repeat; `bench rollouts` measures them"
         if ":" not in name:  # a shipped task, which tests check
@@ -48,6 +53,7 @@ def task_findings(name: str) -> Iterator[Finding]:
             return
     if task.kind == "jax":
         yield "ok", "the observations and rewards of episodes of random policies are finite"
+        yield from step_findings(task, answers[0]["step"])
         return
     first, second = answers
     tried, other = compared(first, second)
@@ -62,6 +68,30 @@ def task_findings(name: str) -> Iterator[Finding]:
     unit = "calls" if task.kind == "function" else "steps"
     rate, memory = max(result["steps_per_second"] for result in (first, second)), first["peak_mib"]
     yield "ok", f"{rate:,.0f} {unit}/s on one core without a policy; its process takes {memory:,} MiB"
+
+
+def step_findings(task: TaskSpec, cost: Mapping[str, Any]) -> Iterator[Finding]:
+    """What a control step of a task in JAX costs, where its descriptor goes, and how far it is from C MuJoCo."""
+    code = "computed by XLA"
+    if cost["operations"]:
+        code = f"compiled to {cost['operations']:,} operations and {cost['code_bytes'] / 1000:,.0f} kB of code"
+    yield "ok", f"a control step is {code}: {cost['steps_per_second']:,.0f} a second on one core without a policy"
+    ranges = zip(task.descriptor_names, task.descriptor_bounds, cost["lowest_B"], cost["greatest_B"], strict=True)
+    for name, (low, high), least, greatest in ranges:
+        if least < low or greatest > high:
+            yield (
+                "note",
+                f"with random actions, its descriptor {name} was in [{least:.3g}, {greatest:.3g}], beyond its bounds "
+                f"[{low:g}, {high:g}]; wider bounds of the task, or map.bounds, keep such places apart in a map",
+            )
+    if error := cost["from_c"]:
+        yield (
+            "ok" if error["p99"] <= max(FAR_FROM_C, 8.0 * error["ulp_p99"]) else "note",
+            f"after one control step from {error['states']} states of random actions ({error['contacts']} in contact), "
+            f"velocities differ from those of C MuJoCo by {error['p99']:.1e} of the greatest (99 %), by "
+            f"{error['max']:.1e} at most; C MuJoCo's own by {error['ulp_p99']:.1e} (99 %) if its state moves by one "
+            "float32 ulp",
+        )
 
 
 def _what(task: TaskSpec) -> str:

@@ -5,6 +5,8 @@
 The model is reaching_arm.xml; these functions say what is rewarded, and what tells two behaviours apart.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from es_service.protocol.noise import uniforms
@@ -21,6 +23,7 @@ class ReachingArm:
     descriptor_bounds = ((-0.9, 0.9), (-0.9, 0.9))
     goal = (0.55, 0.02)
     walls = (((0.35, -0.3), (0.35, 0.1)),)
+    mj_model: Any  # the compiled model, which is there when these functions are called
     options = {"noise": Option(0.02, low=0.0)}  # noqa: RUF012
 
     def __init__(self, noise: float = 0.02) -> None:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import sys
 import textwrap
+from dataclasses import asdict
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from es_service.cli.doctor_task import step_findings
 from es_service.protocol.errors import TaskError
 from es_service.protocol.sources import modules_of, user_sources
 from workers.environments import describe_environment, make_environment
 from workers.environments.mujoco_parts import mujoco
+from workers.step_cost import LANES, step_cost
 
 ARM = "tests.examples.reaching_arm:ReachingArm"
 XML = """<mujoco><option timestep="0.01"/><worldbody><body><joint type="slide" axis="1 0 0"/><geom size="0.1"/>
-<site name="tip" pos="0.5 0 0"/></body></worldbody><actuator><motor ctrlrange="-2 4" gear="50" joint="{joint}"/></actuator>
+<site name="tip" pos="0.5 0 0"/></body></worldbody>
+<actuator><motor ctrlrange="-2 4" gear="50" joint="{joint}"/></actuator>
 <sensor><jointpos joint="{joint}"/></sensor></mujoco>"""
 XML = XML.replace('<joint type="slide"', '<joint name="{joint}" type="slide"').replace("{joint}", "x")
 
@@ -28,6 +33,7 @@ class Slider:
     model = XML
     frame_skip, episode_steps = 5, 20
     descriptor_names, descriptor_bounds = ("x",), ((-1.0, 1.0),)
+    mj_model: Any
 
     def reward(self, data, earlier):
         return data.sensordata[0] - earlier.qpos[0] + 0.0 * data.ctrl[0]
@@ -77,7 +83,7 @@ class NoReward:
 
 
 class WideReward(Slider):
-    def reward(self, data):
+    def reward(self, data, earlier):
         return data.qpos
 
 
@@ -172,6 +178,20 @@ def test_the_files_of_a_model_are_code(tmp_path, monkeypatch):
         describe_environment("robots.slide:Hidden")
     for module in ("robots", "robots.slide"):
         sys.modules.pop(module, None)
+
+
+@pytest.mark.slow
+def test_what_a_control_step_costs_and_how_far_it_is_from_c_mujoco():
+    """For `doctor`: C MuJoCo's own error by an ulp is of the same size; the descriptor leaves its bounds."""
+    cost = step_cost(describe_environment(f"{__name__}:Slider"), {}, 0.0)
+    assert cost.operations > 0
+    assert cost.steps_per_second > 0
+    assert cost.greatest_B[0] > 1.0
+    assert cost.from_c["states"] == LANES
+    assert 0.0 < cost.from_c["p99"] < 8.0 * cost.from_c["ulp_p99"] < 1e-4
+    findings = step_findings(describe_environment(f"{__name__}:Slider"), asdict(cost))
+    levels = {sentence.partition(" ")[0]: level for level, sentence in findings}
+    assert levels == {"a": "ok", "with": "note", "after": "ok"}
 
 
 @pytest.mark.slow

@@ -126,9 +126,9 @@ def describe(path: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
     return replace(spec, notes=unknown_attributes(path, task, KNOWN))
 
 
-def has_model(task: Any) -> bool:
+def has_model(kind: Any) -> bool:
     """Whether a class has a model of MuJoCo in the place of steps of its own (`mujoco_task.py`)."""
-    return not hasattr(task, "step") and (hasattr(task, "model") or hasattr(task, "frame_skip"))
+    return not hasattr(kind, "step") and (hasattr(kind, "model") or hasattr(kind, "frame_skip"))
 
 
 def wrong_types(task: Any, attributes: Mapping[str, type]) -> list[str]:

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,8 @@ class Examined:
     """Most memory of the process, in MiB."""
     fault: str = ""
     """What is not finite in the first such episode of random policies, with its reset; empty if all is."""
+    step: dict[str, Any] = field(default_factory=dict)
+    """Of a task in JAX: the fields of `workers.step_cost.StepCost`."""
 
 
 def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) -> Examined:
@@ -76,7 +78,11 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
         hashes = {ALONE: call(SEED), "after another call": (call(OTHER_SEED), call(SEED))[1]}
         return _measured(hashes, lambda: (call(SEED), 1)[1], seconds)
     if task.kind == "jax":
-        return Examined({}, 0.0, peak_memory_mib(), _fault(task, options))
+        from workers.step_cost import step_cost
+
+        fault = _fault(task, options)
+        step = {} if fault else asdict(step_cost(task, options, seconds))
+        return Examined({}, 0.0, peak_memory_mib(), fault, step)
     made, key = make_host_task(task.name, options), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
     coordinates = np.arange(STEPS * task.action_size, dtype=np.uint32)
     action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
