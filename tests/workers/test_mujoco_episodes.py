@@ -51,25 +51,31 @@ def most_steps(name: str) -> int:
 
 def our_episodes(name: str) -> Callable[[np.ndarray, np.ndarray], Episodes]:
     """Function from policies [N, action, seen] and reset keys [N] to episodes."""
-    environment, steps = make_environment(f"mujoco:{name}", {}), most_steps(name)
+    environment = make_environment(f"mujoco:{name}", {})
+    key, policy = jax.ShapeDtypeStruct((4,), np.uint32), jax.ShapeDtypeStruct(policy_shape(name), np.float32)
 
-    def episode(policy: Any, key: Any) -> tuple[Any, ...]:
-        def is_alive(carry: tuple[Any, ...]) -> Any:
-            return carry[3] & (carry[2] < steps)
+    def step(policy: Any, state: Any) -> tuple[Any, ...]:
+        action = jnp.tanh(policy @ environment.observe(state)[: policy.shape[1]])
+        state, reward, done = environment.step(state, action)
+        return state, reward, done, environment.descriptor(state)
 
-        def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            state, total, length, _ = carry
-            action = jnp.tanh(policy @ environment.observe(state)[: policy.shape[1]])
-            state, reward, done = environment.step(state, action)
-            return state, total + reward, length + 1, ~done
+    begin = compile_kernel(environment.reset, key)
+    advance = compile_kernel(step, policy, jax.eval_shape(environment.reset, key))
 
-        begun = environment.reset(key), jnp.float32(0.0), jnp.int32(0), jnp.bool_(True)
-        state, total, length, _ = jax.lax.while_loop(is_alive, step, begun)
-        return total, length, environment.descriptor(state)
+    def run(policies: np.ndarray, keys: np.ndarray) -> Episodes:
+        state, alive = begin(keys), np.ones(len(keys), bool)
+        total, length, ends = np.zeros(len(keys)), np.zeros(len(keys), int), None
+        for _ in range(most_steps(name)):
+            state, reward, done, descriptor = advance(policies.astype(np.float32), state)
+            total, length = total + np.where(alive, reward, 0.0), length + alive
+            ends = descriptor if ends is None else np.where(alive[:, None], descriptor, ends)
+            alive &= ~done
+            if not alive.any():
+                break
+        assert ends is not None
+        return Episodes(total, length, ends)
 
-    shape = policy_shape(name)
-    kernel = compile_kernel(episode, jax.ShapeDtypeStruct(shape, np.float32), jax.ShapeDtypeStruct((4,), np.uint32))
-    return lambda policies, keys: Episodes(*kernel(policies.astype(np.float32), keys))
+    return run
 
 
 def policy_shape(name: str) -> tuple[int, int]:

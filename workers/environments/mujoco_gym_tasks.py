@@ -317,7 +317,7 @@ TASKS = {
     "InvertedDoublePendulum-v5": GymTask("inverted_double_pendulum.xml", 5, _inverted_double_pendulum),
 }
 """Environments by their IDs in Gymnasium."""
-_HUMANOID = "MJX has 138 places for its contacts, and episodes with them are more operations than simd compiles"
+_HUMANOID = "MJX has 138 places for its contacts, whose code takes minutes to compile"
 REFUSED = {
     "Humanoid-v5": _HUMANOID,
     "HumanoidStandup-v5": _HUMANOID,
