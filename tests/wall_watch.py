@@ -11,8 +11,8 @@ import numpy as np
 from es_service.protocol.messages import Segment
 from workers.environments import ant_maze, ant_trap
 from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
+from workers.environments.ant_tasks import WALL_RADIUS
 from workers.environments.brax_parts import Transform
-from workers.environments.walls import WALL_RADIUS
 
 Walls = tuple[Segment, ...]
 WALLS: dict[str, Walls] = {"ant_maze": ant_maze.WALLS, "ant_trap": ant_trap.WALLS}

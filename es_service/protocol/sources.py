@@ -40,6 +40,8 @@ LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
 MODELS, MODEL_FILES = "mujoco", "envs/mujoco/assets"
 """Kind of the tasks whose models are files of this library, and the folder of its package that contains them."""
+OUR_NAMESPACE, OUR_ENVIRONMENTS = "es_service", "es_service.gymnasium"
+"""Gymnasium's namespace of our tasks, and the module that registers them."""
 NAMED = 5
 """Names of files in a sentence."""
 SHARED_FOLDERS = ("site-packages", "dist-packages")
@@ -134,14 +136,15 @@ def user_path(name: str) -> str:
 
     `brax:NAME` and `mujoco:ID` are none. What is simulated by Python has the kind of the task before the path, as in
     `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module that
-    registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace.
+    registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace; ours, as in
+    `gymnasium:es_service/AntMazeMujoco-v0`, are none.
     """
     kind, colon, rest = name.partition(":")
     if kind in ("brax", "mujoco"):
         return ""
     if kind == LIBRARY:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")
-        return f"{module}:{environment}" if separator else ""
+        return f"{module}:{environment}" if separator and module != OUR_NAMESPACE else ""
     return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
 
 

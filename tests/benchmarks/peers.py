@@ -39,7 +39,8 @@ from tests.benchmarks import vector_env
 from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, python_of, their_versions, there_are
 from tests.benchmarks.rollouts_per_second import ANT_STEPS, config_of, measure
 from tests.helpers import centre
-from workers.environments.ant import STEP_S, SUBSTEPS
+from workers.environments.ant import SUBSTEPS
+from workers.environments.ant_tasks import STEP_S
 from workers.policies.policy import initial_parameters
 
 ROOT = Path(__file__).parents[2]

@@ -31,7 +31,7 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
 
     from es_service.protocol.noise import Domain, stream_keys
     from tests.wall_watch import WALLS, colliders, crosses, depth, places_beside_walls
-    from workers.environments import ant_maze
+    from workers.environments import ant_maze, ant_tasks
     from workers.environments.ant import make_ant
 
     if (name, drive) not in _compiled:
@@ -47,7 +47,7 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
                 moved = ant.step(state, action)
                 x, y = moved.q[:2]
                 in_pocket = (x < 10) & (x > 0) & (y < -15) & (name == "ant_maze")
-                reward = -jnp.hypot(x - ant_maze.GOAL[0], y - ant_maze.GOAL[1])
+                reward = -jnp.hypot(x - ant_tasks.MAZE_GOAL[0], y - ant_tasks.MAZE_GOAL[1])
                 now = {
                     "deepest": jnp.maximum(record["deepest"], depth(colliders(ant.system, moved), walls)),
                     "crossed": record["crossed"] | crosses(state.q[:2], moved.q[:2], walls),

@@ -8,9 +8,9 @@ import pytest
 
 from es_service.search.maps.geometry import Grid, make_geometry, reachable_cells
 from tests.es_service.map_examples import SQUARE, map_config
-from workers.environments import ANT_CLEARANCE, SHIPPED, ant_maze, point_maze
+from workers.environments import ANT_CLEARANCE, SHIPPED, ant_tasks, point_maze
 from workers.environments.ant import TORSO_RADIUS
-from workers.environments.walls import WALL_RADIUS
+from workers.environments.ant_tasks import WALL_RADIUS
 
 
 def test_coverage_of_reachable_cells_knows_the_border_and_gives_up_on_too_many():
@@ -111,7 +111,7 @@ def test_an_ant_comes_as_near_to_a_wall_as_both_are_thick_less_what_the_wall_giv
 
 
 @pytest.mark.parametrize(
-    ("name", "goal", "within"), [("point_maze", point_maze.GOAL, 1e-4), ("ant_maze", ant_maze.GOAL, 0.1)]
+    ("name", "goal", "within"), [("point_maze", point_maze.GOAL, 1e-4), ("ant_maze", ant_tasks.MAZE_GOAL, 0.1)]
 )
 def test_the_least_reward_of_a_maze_is_that_of_its_farthest_corner(name, goal, within):
     assert SHIPPED[name].goal == goal

@@ -8,7 +8,7 @@ All methods are pure functions of one ant's state that JAX can trace; they are b
 import jax.numpy as jnp
 
 from es_service.protocol.options import Option
-from workers.environments.ant import ant_viewer, make_ant, observe
+from workers.environments.ant import make_ant, observe
 
 # Axes of the walls, in metres; each is thickened by half a metre and cannot be climbed.
 GATES = (
@@ -57,4 +57,4 @@ class AntSlalom:
 
     def viewer(self):
         """What `es-service report` replays episodes with."""
-        return ant_viewer(self.ant.system)
+        return self.ant.viewer

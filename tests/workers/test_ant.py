@@ -28,7 +28,8 @@ from tests.workers.steps import (
 )
 from workers import rollout as xla
 from workers.environments import SHIPPED, make_environment
-from workers.environments.ant import STEP_S, AntState, contact_forces, load_system, observe
+from workers.environments.ant import AntState, contact_forces, load_system, observe
+from workers.environments.ant_tasks import STEP_S
 from workers.environments.brax_parts import pipeline
 from workers.policies.policy import act, initial_parameters, split_layers
 from workers.simd.episodes import rollout as simd

@@ -11,7 +11,7 @@ from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
 from tests.workers.steps import carried, of_many, pushed, resets_of, steps_of, system_of
 from workers.environments import ant_maze
-from workers.environments.ant import STEP_S
+from workers.environments.ant_tasks import STEP_S
 
 pytestmark = [
     pytest.mark.slow,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from workers.environments import ant_maze, ant_trap
-from workers.environments.walls import WALL_RADIUS, nearest_wall
+from workers.environments.ant_tasks import WALL_RADIUS
+from workers.environments.walls import nearest_wall
 
 RADIUS = 0.08
 ALONG_X = (((0.0, 0.0), (4.0, 0.0)),)

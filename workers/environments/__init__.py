@@ -25,6 +25,8 @@ ANT_CLEARANCE = 0.65
 
 It is half the width of a wall plus the torso's radius, minus the 0.1 m by which a wall may give way.
 """
+PHYSICS = ("spring", "mujoco")
+"""Physics of the ants: Brax's springs, or MuJoCo by MJX."""
 
 SHIPPED: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(
@@ -52,6 +54,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         descriptor_bounds=((-35.0, 40.0), (-35.0, 40.0)),
         final_fitness=True,
         has_goal=True,
+        options={"physics": choice(*PHYSICS)},
         walls=(
             ((-35.0, -35.0), (40.0, -35.0)),
             ((-35.0, 40.0), (40.0, 40.0)),
@@ -76,6 +79,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         descriptor_bounds=((0.0, 30.0), (-8.0, 8.0)),
         final_fitness=False,
         has_goal=False,
+        options={"physics": choice(*PHYSICS), "contact_forces": choice("computed", "zero")},
         walls=(((12.0, -2.0), (12.0, 2.0)), ((7.0, 3.0), (12.0, 3.0)), ((7.0, -3.0), (12.0, -3.0))),
         wall_clearance=ANT_CLEARANCE,
         success="the ant has passed x = 20",

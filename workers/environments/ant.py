@@ -2,7 +2,7 @@
 
 A substep is Brax's own `brax.spring.pipeline.step`, to which contacts with walls are added and whose contact impulses
 are recorded. A control step has ten substeps. The state between control steps is small: positions and velocities of the
-links, and the sum of the contact impulses.
+links, and the sum of the contact impulses. `ant_mujoco.py` has the ant in MuJoCo's physics, with the same functions.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from etils import epath
 
 from es_service.protocol.noise import uniforms
+from workers.environments.ant_tasks import BODIES, FORCE_LIMIT, JOINTS, RESET_NOISE, STEP_S, WALL_RADIUS
 from workers.environments.brax_parts import (
     Contact,
     Motion,
@@ -33,29 +34,19 @@ from workers.environments.brax_parts import (
     pipeline,
     quietly,
 )
-from workers.environments.walls import WALL_RADIUS, Segment, nearest_wall
+from workers.environments.walls import Segment, nearest_wall
 from workers.viewer import Viewer
 
 SUBSTEPS = 10
-SUBSTEP_S = 0.005
-STEP_S = SUBSTEPS * SUBSTEP_S
-"""Seconds of a control step."""
-JOINTS = 8
-RESET_NOISE = 0.1
-"""Half-width of the uniform noise on joint angles (radians) and joint velocities (radians per second) at reset."""
+SUBSTEP_S = STEP_S / SUBSTEPS
 TORSO_RADIUS, LEG_RADIUS = 0.25, 0.08
 LEG_LENGTH = 0.4
 """Extent of a lower leg along x and along y in its own frame, in metres."""
 LOWER_LEGS = ((2, 1, 1), (4, -1, 1), (6, -1, -1), (8, 1, -1))
 """(link, sign of x, sign of y) of the lower legs in Gym's order: front left, front right, back left, back right."""
 TORSO = 0
-BODIES = 14
-"""Number of bodies of Gym's ant: world, torso, then (leg, aux, foot) of each leg. Only the torso and the feet can touch
-anything."""
 BODY_OF_LINK = {TORSO: 1, **{link: 4 + 3 * leg for leg, (link, _, _) in enumerate(LOWER_LEGS)}}
 """Number of the body of Gym's ant for each link that can touch something."""
-FORCE_LIMIT = 1.0
-"""Bound of the contact forces in the observation of AntTrap."""
 
 
 class AntState(NamedTuple):
@@ -75,13 +66,31 @@ class AntState(NamedTuple):
 
 
 class Ant(NamedTuple):
-    """Functions of the state of one ant among walls."""
+    """Functions of the state of one ant among walls. States have `q` [15] and `qd` [14], as of an `AntState`."""
 
-    system: System
-    reset: Callable[[Any, tuple[float, float]], AntState]
+    reset: Callable[[Any, tuple[float, float]], Any]
     """Function (stream key, start xy) -> state."""
-    step: Callable[[AntState, Any], AntState]
-    """Function (state, action [8]) -> state one control step later; Brax clips actions to [-1, 1]."""
+    step: Callable[[Any, Any], Any]
+    """Function (state, action [8]) -> state one control step later; actions are clipped to [-1, 1]."""
+    viewer: Viewer
+    """Data for replays."""
+    contact_forces: Callable[[Any], Any]
+    """Function from a state to torque and force on each of 14 bodies [84], in Gym's order, clipped."""
+    system: System | None = None
+    """Brax's system; None in MuJoCo's physics."""
+
+
+def ant_in(physics: str, walls: tuple[Segment, ...]) -> Ant:
+    """The ant of a task in the physics that its option names: `spring` or `mujoco`.
+
+    Raises:
+        TaskError: what the physics needs is not installed.
+    """
+    if physics == "spring":
+        return make_ant(walls)
+    from workers.environments import ant_mujoco
+
+    return ant_mujoco.make_ant(walls)
 
 
 def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
@@ -89,7 +98,7 @@ def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
     system = load_system(walls)
 
     def reset(key: Any, start: tuple[float, float]) -> AntState:
-        u = (2.0 * uniforms(key, jnp.arange(2 * JOINTS, dtype=jnp.uint32)) - 1.0) * RESET_NOISE
+        u = joint_noise(key)
         q = system.init_q.at[7:].add(u[:JOINTS]).at[:2].set(jnp.array(start, jnp.float32))
         qd = jnp.zeros(6 + JOINTS, jnp.float32).at[6:].set(u[JOINTS:])
         state = pipeline.init(system, q, qd)
@@ -105,7 +114,12 @@ def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
         physics, push = jax.lax.fori_loop(0, SUBSTEPS, substep, (expand(system, state), none))
         return AntState(physics.x_i, physics.xd_i, physics.q, physics.qd, push / STEP_S)
 
-    return Ant(system, reset, step)
+    return Ant(reset, step, ant_viewer(system), contact_forces, system)
+
+
+def joint_noise(key: Any) -> Any:
+    """Noise of a reset on the angles of the joints, then on their velocities [16]."""
+    return (2.0 * uniforms(key, jnp.arange(2 * JOINTS, dtype=jnp.uint32)) - 1.0) * RESET_NOISE
 
 
 def physics_step(system: System, state: State, action: Any, walls: tuple[Segment, ...]) -> tuple[State, Motion]:
@@ -139,8 +153,8 @@ def expand(system: System, state: AntState) -> State:
     )  # fmt: skip
 
 
-def observe(state: AntState) -> Any:
-    """Gym's observation [27]: torso height and quaternion, joint angles, all velocities."""
+def observe(state: Any) -> Any:
+    """Gym's observation [27] of a state of any physics: torso height and quaternion, joint angles, all velocities."""
     return jnp.concatenate([state.q[2:], state.qd])
 
 

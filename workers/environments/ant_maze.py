@@ -11,45 +11,45 @@ from typing import Any
 import jax.numpy as jnp
 
 from workers.environments import SHIPPED, Environment
-from workers.environments.ant import AntState, ant_viewer, make_ant, observe
+from workers.environments.ant import ant_in, observe
+from workers.environments.ant_tasks import MAZE_BOUNDS, MAZE_GOAL, MAZE_NEAR, MAZE_START
 
 WALLS = SHIPPED["ant_maze"].walls or ()
-LOW, HIGH = SHIPPED["ant_maze"].descriptor_bounds[0]
-"""Bounds of the arena in x and in y; it is a square."""
-START = (-25.0, -25.0)
-GOAL = (35.0, -25.0)
-NEAR = 5.0
-"""Distance from the goal, in metres, within which an episode that ends there succeeds."""
+LOW, HIGH = MAZE_BOUNDS
 MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0
 """Middle of the arena and half of its side; they scale positions in observations to [-1, 1]."""
 
 
-def make() -> Environment:
-    """Functions of AntMaze, which has no options."""
-    ant = make_ant(WALLS)
+def make(physics: str = "spring") -> Environment:
+    """Functions of AntMaze.
 
-    def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:
+    Args:
+        physics: `spring` or `mujoco`; see `ant_in`.
+    """
+    ant = ant_in(physics, WALLS)
+
+    def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
         state = ant.step(state, action)
         return state, -_goal_distance(state), jnp.array(False)
 
-    def reset(key: Any) -> AntState:
-        return ant.reset(key, START)
+    def reset(key: Any) -> Any:
+        return ant.reset(key, MAZE_START)
 
-    return Environment(reset, _observe, step, _position, _goal_distance, _near_goal, ant_viewer(ant.system))
+    return Environment(reset, _observe, step, _position, _goal_distance, _near_goal, ant.viewer)
 
 
-def _position(state: AntState) -> Any:
+def _position(state: Any) -> Any:
     return state.q[:2]
 
 
-def _observe(state: AntState) -> Any:
+def _observe(state: Any) -> Any:
     return jnp.concatenate([(_position(state) - MIDDLE) / HALF, observe(state)])
 
 
-def _goal_distance(state: AntState) -> Any:
-    dx, dy = state.q[0] - GOAL[0], state.q[1] - GOAL[1]
+def _goal_distance(state: Any) -> Any:
+    dx, dy = state.q[0] - MAZE_GOAL[0], state.q[1] - MAZE_GOAL[1]
     return jnp.sqrt(dx * dx + dy * dy)
 
 
-def _near_goal(state: AntState, before: Any) -> Any:
-    return _goal_distance(state) <= NEAR
+def _near_goal(state: Any, before: Any) -> Any:
+    return _goal_distance(state) <= MAZE_NEAR

@@ -11,53 +11,67 @@ from typing import Any
 import jax.numpy as jnp
 
 from workers.environments import SHIPPED, Environment
-from workers.environments.ant import STEP_S, AntState, ant_viewer, contact_forces, make_ant, observe
+from workers.environments.ant import ant_in, observe
+from workers.environments.ant_tasks import (
+    BODIES,
+    STEP_S,
+    TRAP_BEYOND_X,
+    TRAP_CONTACT_COST,
+    TRAP_CONTROL_COST,
+    TRAP_HEALTHY_Z,
+    TRAP_START,
+    TRAP_SURVIVAL_REWARD,
+)
 
 WALLS = SHIPPED["ant_trap"].walls or ()
 DESCRIPTOR_BOUNDS = SHIPPED["ant_trap"].descriptor_bounds
-START = (0.0, 0.0)
-HEALTHY_Z = (0.2, 1.0)
-"""Range of the torso's height, in metres; the episode ends outside of it."""
-SURVIVAL_REWARD = 1.0
-BEYOND_X = 20.0
-"""x of the torso, in metres, beyond which an episode has succeeded."""
-CONTROL_COST, CONTACT_COST = 0.5, 5e-4
 
 
-def make() -> Environment:
-    """Functions of AntTrap, which has no options."""
-    ant = make_ant(WALLS)
+def make(physics: str = "spring", contact_forces: str = "computed") -> Environment:
+    """Functions of AntTrap.
 
-    def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:
+    Args:
+        physics: `spring` or `mujoco`; see `ant_in`.
+        contact_forces: `computed`, as in Gym's ant and in the benchmark; or `zero` in observations and in the reward,
+            as with mujoco-py and MuJoCo 2, which did not compute them.
+    """
+    ant = ant_in(physics, WALLS)
+
+    def forces(state: Any) -> Any:
+        return ant.contact_forces(state) if contact_forces == "computed" else jnp.zeros(6 * BODIES, jnp.float32)
+
+    def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
         new = ant.step(state, action)
         forward = (new.q[0] - state.q[0]) / STEP_S
         # The cost is that of the clipped action, as the motors apply it: noise beyond the limits has no effect or cost.
-        control = CONTROL_COST * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
-        contact = CONTACT_COST * jnp.sum(contact_forces(new) ** 2)
-        done = (new.q[2] < HEALTHY_Z[0]) | (new.q[2] > HEALTHY_Z[1])
-        return new, forward + SURVIVAL_REWARD - control - contact, done
+        control = TRAP_CONTROL_COST * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
+        contact = TRAP_CONTACT_COST * jnp.sum(forces(new) ** 2)
+        done = (new.q[2] < TRAP_HEALTHY_Z[0]) | (new.q[2] > TRAP_HEALTHY_Z[1])
+        return new, forward + TRAP_SURVIVAL_REWARD - control - contact, done
 
-    def reset(key: Any) -> AntState:
-        return ant.reset(key, START)
+    def reset(key: Any) -> Any:
+        return ant.reset(key, TRAP_START)
 
-    return Environment(reset, _observe, step, _descriptor, _no_goal, _beyond, ant_viewer(ant.system))
+    def observe_all(state: Any) -> Any:
+        return jnp.concatenate([_position(state), observe(state), forces(state)])
+
+    return Environment(reset, observe_all, step, _descriptor, _no_goal, _beyond, ant.viewer)
 
 
-def _observe(state: AntState) -> Any:
+def _position(state: Any) -> Any:
     (x_low, x_high), (_, y_high) = DESCRIPTOR_BOUNDS
     half = (x_high - x_low) / 2.0
-    position = jnp.stack([(state.q[0] - x_low - half) / half, state.q[1] / y_high])
-    return jnp.concatenate([position, observe(state), contact_forces(state)])
+    return jnp.stack([(state.q[0] - x_low - half) / half, state.q[1] / y_high])
 
 
-def _descriptor(state: AntState) -> Any:
+def _descriptor(state: Any) -> Any:
     low, high = (jnp.array(side, jnp.float32) for side in zip(*DESCRIPTOR_BOUNDS, strict=True))
     return jnp.clip(state.q[:2], low, high)
 
 
-def _beyond(state: AntState, before: Any) -> Any:
-    return before | (state.q[0] > BEYOND_X)
+def _beyond(state: Any, before: Any) -> Any:
+    return before | (state.q[0] > TRAP_BEYOND_X)
 
 
-def _no_goal(state: AntState) -> Any:
+def _no_goal(state: Any) -> Any:
     return jnp.float32(jnp.nan)

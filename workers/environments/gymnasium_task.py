@@ -1,9 +1,10 @@
 """Environments of Gymnasium as tasks, named `gymnasium:ID`, such as `gymnasium:Ant-v5`.
 
 An ID may have the module that registers it before it, `gymnasium:package.module:Name-v0`; else, if it has a namespace
-that is the name of a module, that module is imported. Observations are those of a Box, flattened, or of a Discrete, one
-number for each value; actions those of a Box, between whose bounds the actions of a policy are put, or of a Discrete,
-among which the policy chooses. `task.options` are keyword arguments of `gymnasium.make`.
+that is the name of a module, that module is imported. Ours have the namespace `es_service`. Observations are those of a
+Box, flattened, or of a Discrete, one number for each value; actions those of a Box, between whose bounds the actions of
+a policy are put, or of a Discrete, among which the policy chooses. `task.options` are keyword arguments of
+`gymnasium.make`.
 
 An episode ends where the environment says that it is terminated or truncated, or after `task.episode_steps`; the time
 limit that Gymnasium adds is left out, and its number of steps is the default. The checks that Gymnasium adds to each
@@ -18,6 +19,7 @@ does.
 from __future__ import annotations
 
 import copy
+import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
@@ -29,7 +31,7 @@ import numpy as np
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.raised import users_error, why_not_imported
-from es_service.protocol.sources import LIBRARY, user_path
+from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE, user_path
 from es_service.protocol.user_code import import_user_module
 from workers.environments import TaskError
 from workers.environments.host_descriptors import describe_descriptor
@@ -161,6 +163,8 @@ def _registered(name: str) -> Any:
     try:
         if own and (":" in name or _exists(module)):
             import_user_module(own)
+        elif name.startswith(f"{OUR_NAMESPACE}/"):
+            importlib.import_module(OUR_ENVIRONMENTS)
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{LIBRARY}:{name}: {why_not_imported(module, error)}") from error
     environment = name.partition(":")[2] if ":" in name else name

@@ -16,7 +16,8 @@ from __future__ import annotations
 import contextlib
 import copy
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -116,6 +117,7 @@ def step_and_look(
     substeps: int,
     look: Callable[[mjx.Data], Any],
     at_once: int = AT_ONCE,
+    contacts: Mapping[Any, Any] = MappingProxyType({}),
 ) -> tuple[MujocoState, Any]:
     """As `step`, with what a function sees in the data of the last substep.
 
@@ -126,6 +128,7 @@ def step_and_look(
         look: function from data to a pytree of arrays.
         at_once: contacts of each `condim` that are computed first; only where more are active, all are computed. The
             number changes the speed, and results by rounding.
+        contacts: functions that find contacts of two types of geoms, in place of those of MJX.
     """
     empty = mjx.make_data(model)
     integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _single_stage
@@ -133,7 +136,7 @@ def step_and_look(
     def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
         return integrate(model, _data(empty, before[0], ctrl), look, at_once), None
 
-    with _contacts_as_c():
+    with contacts_as_c(contacts):
         first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
         begun = state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
         return substep(begun, None)[0] if substeps == 1 else jax.lax.scan(substep, begun, None, length=substeps)[0]
@@ -210,9 +213,15 @@ def _turning(model: mjx.Model, moved: Any, qvel: Any) -> Any:
     return qvel
 
 
-def forward(model: mjx.Model, state: MujocoState, ctrl: Any) -> mjx.Data:
-    """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors."""
-    with _contacts_as_c():
+def forward(
+    model: mjx.Model, state: MujocoState, ctrl: Any, contacts: Mapping[Any, Any] = MappingProxyType({})
+) -> mjx.Data:
+    """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors.
+
+    Args:
+        contacts: as of `step_and_look`.
+    """
+    with contacts_as_c(contacts):
         return _forward(model, _data(mjx.make_data(model), state, ctrl), AT_ONCE)
 
 
@@ -261,16 +270,16 @@ def _plane_capsule(plane: Any, capsule: Any) -> tuple[Any, Any, Any]:
 
 
 @contextlib.contextmanager
-def _contacts_as_c() -> Iterator[None]:
-    """Context manager in which MJX is traced with the contacts of C MuJoCo."""
-    functions, pair = collision_driver._COLLISION_FUNC, (types.GeomType.PLANE, types.GeomType.CAPSULE)
+def contacts_as_c(more: Mapping[Any, Any]) -> Iterator[None]:
+    """Context manager in which MJX is traced with the contacts of C MuJoCo, and with more functions for contacts."""
+    functions, plane = collision_driver._COLLISION_FUNC, (types.GeomType.PLANE, types.GeomType.CAPSULE)
     with quietly():
-        before = functions[pair]
-        functions[pair] = _plane_capsule
+        before = dict(functions)
+        functions.update({plane: _plane_capsule, **more})
         try:
             yield
         finally:
-            functions[pair] = before
+            functions.update(before)
 
 
 def contact_forces(model: mjx.Model, data: Any) -> Any:

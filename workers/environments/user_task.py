@@ -25,7 +25,7 @@ A class with a model of MuJoCo has less to say, see `mujoco_task.py`. It may als
   least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
   and `goal`, a place (x, y). Reports draw both;
 - `viewer(self)`, if the task has bodies: a `workers.viewer.Viewer`, with which reports replay episodes in three
-  dimensions. `workers.environments.ant.ant_viewer` makes that of an ant;
+  dimensions. `workers.environments.ant.make_ant(...).viewer` is that of an ant;
 - `least_reward`: the reward per step from which QD-scores are counted;
 - a docstring, whose first line `es-service` shows.
 

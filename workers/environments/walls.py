@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import Segment
+from workers.environments.ant_tasks import WALL_RADIUS
 
-WALL_RADIUS = 0.5
-"""Half the thickness of a wall, in metres."""
 TINY = 1e-9
 """Least divisor, which avoids divisions by 0."""
 
@@ -59,7 +58,7 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     for end_W_2 in (start_W_2, ends[:, 1]):
         share_W = jnp.clip(_dot(end_W_2 - foot_2, leg_2) * inverse_leg, 0.0, 1.0)
         candidates.append((foot_2 + share_W[:, None] * leg_2 - end_W_2, share_W))
-    square_W, offset_W_2, along_W = _least([(_dot(offset, offset), offset, along) for offset, along in candidates])
+    square_W, offset_W_2, along_W = least([(_dot(offset, offset), offset, along) for offset, along in candidates])
 
     # The nearest wall is the one with the least square of the gap; the square is negative if the foot has passed it.
     side_foot_W, side_knee_W = _cross(way_W_2, foot_2 - start_W_2), _cross(way_W_2, knee_2 - start_W_2)
@@ -70,7 +69,7 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     square_W = jnp.where(crosses_W, -through_W * through_W, square_W)
     offset_W_2 = jnp.where(crosses_W[:, None], across_W_2 * jnp.sign(side_knee_W)[:, None], offset_W_2)
     along_W = jnp.where(crosses_W, 0.0, along_W)
-    square, offset_2, along, came_through = _least(list(zip(square_W, offset_W_2, along_W, crosses_W, strict=True)))
+    square, offset_2, along, came_through = least(list(zip(square_W, offset_W_2, along_W, crosses_W, strict=True)))
 
     gap = jnp.sqrt(jnp.abs(square))
     normal_2 = jnp.where(came_through, offset_2, offset_2 * (1.0 / jnp.maximum(gap, TINY)))
@@ -84,7 +83,7 @@ def _dot(a_2: Any, b_2: Any) -> Any:
     return (a_2 * b_2).sum(-1)
 
 
-def _least(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
+def least(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
     """Row whose first entry is least, element by element; of equal ones the first row."""
     best = rows[0]
     for row in rows[1:]:

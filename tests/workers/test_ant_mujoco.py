@@ -1,0 +1,235 @@
+"""AntMaze and AntTrap in MuJoCo's physics, by MJX, against C MuJoCo: contacts, control steps, episodes, walls.
+
+A state that moves by one float32 ulp shows how exact a comparison can be: C MuJoCo's own answer moves, too.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mujoco.mjx._src import collision_driver, smooth
+
+from tests import mujoco_ants as ants
+from tests.mujoco_models import relative_error
+from workers.environments import (
+    SHIPPED,
+    TaskError,
+    ant_model,
+    describe_environment,
+    make_environment,
+    make_host_task,
+)
+from workers.environments.ant_mujoco import MujocoAntState
+from workers.environments.host_task import HostEnvironment
+from workers.environments.mujoco_parts import contacts_as_c, mjx, mujoco, put_model
+from workers.environments.wall_boxes import SLOTS, wall_contacts
+from workers.viewer import scene
+
+pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")
+TASKS = ("ant_maze", "ant_trap")
+TIMES = 8.0
+"""Errors may be so many times as great as what one ulp of a state makes in C MuJoCo: a step rounds thousands of
+times."""
+
+
+def poses_in_walls(task: str, count: int) -> np.ndarray:
+    """[N, 15] ants turned and bent at random, within and beyond the limits of their joints, most of them at corners,
+    as deep in walls as no ant comes."""
+    rng, box_W_4 = np.random.default_rng(0), ants.boxes(task)
+    box_N_4 = box_W_4[rng.integers(len(box_W_4), size=count)]
+    at_corner = rng.random((count, 2)) < 0.8
+    share_N_2 = np.where(at_corner, rng.choice([-1, 1], (count, 2)), rng.uniform(-1, 1, (count, 2)))
+    place_N_2 = box_N_4[:, :2] + share_N_2 * box_N_4[:, 2:] + rng.uniform(-1.2, 1.2, (count, 2))
+    turn_N_4 = rng.normal(size=(count, 4))
+    turn_N_4 /= np.linalg.norm(turn_N_4, axis=1, keepdims=True)
+    height_N_1, joint_N_8 = rng.uniform(0.1, 1.2, (count, 1)), rng.uniform(-1.3, 1.3, (count, 8))
+    return np.concatenate([place_N_2, height_N_1, turn_N_4, joint_N_8], axis=1, dtype=np.float32)
+
+
+def contacts_of_c(task: str, qpos_N: np.ndarray) -> list[np.ndarray]:
+    """[n, 13] distance, position and frame of each contact of each pose."""
+    model = ant_model.ant_model(SHIPPED[task].walls or ())
+    data, found = mujoco.MjData(model), []
+    for qpos in qpos_N:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        found.append(np.array([[one.dist, *one.pos, *one.frame] for one in data.contact]).reshape(-1, 13))
+    return found
+
+
+def contacts_of_ours(task: str, qpos_N: np.ndarray) -> list[np.ndarray]:
+    box_W_4 = ants.boxes(task)
+    mx, contacts = put_model(ant_model.compiled(box_W_4[:SLOTS])), wall_contacts(box_W_4)
+
+    def collide(qpos):
+        with contacts_as_c(contacts):
+            data: Any = smooth.kinematics(mx, mjx.make_data(mx).replace(qpos=qpos))
+            collided: Any = collision_driver.collision(mx, data)
+        found = collided._impl.contact
+        return jnp.concatenate(
+            [found.dist[:, None], found.pos, found.frame.reshape(-1, 9)], axis=1
+        ), found.includemargin
+
+    rows, margins = map(np.asarray, jax.jit(jax.vmap(collide))(qpos_N))
+    return [row[row[:, 0] < margin] for row, margin in zip(rows, margins, strict=True)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_contacts_with_walls_are_those_of_c_mujoco(task: str):
+    """Each of C MuJoCo's contacts is found and no other, of ants anywhere at walls and in corners: the two nearest
+    walls of a collider are enough."""
+    qpos_N = poses_in_walls(task, 1000)
+    of_c, of_ours = contacts_of_c(task, qpos_N), contacts_of_ours(task, qpos_N)
+    assert np.mean([len(rows) > 4 for rows in of_c]) > 0.3
+    # two contacts of an axis that only just comes past an edge may be one by float32, at the same place
+    assert np.mean([len(right) == len(found) for right, found in zip(of_c, of_ours, strict=True)]) > 0.998
+    errors = []
+    for right, found in zip(of_c, of_ours, strict=True):
+        assert bool(len(right)) == bool(len(found))
+        if len(right):
+            error = np.abs(right[:, None] - found).max(axis=2)
+            errors.append(max(error.min(axis=0).max(), error.min(axis=1).max()))
+    print("\n", sum(map(len, of_c)), "contacts", np.quantile(errors, [0.5, 0.99, 1.0]))
+    assert np.quantile(errors, 0.99) < 1e-4
+    assert np.max(errors) < 2e-3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("task", TASKS)
+def test_a_control_step_is_that_of_c_mujoco(task: str):
+    """Of 1,000 states: 99 % of errors are at most TIMES the greatest that one ulp makes in C MuJoCo, with its unit
+    1e-6."""
+    given, rng = ants.states(task, 1000), np.random.default_rng(1)
+    (truth, touches), found, moved = ants.steps_in_c(task, given), ants.steps_by_simd(task, given), []
+    for _ in range(4):
+        qpos, qvel = (
+            np.nextafter(x, np.where(rng.random(x.shape) < 0.5, -9e9, 9e9).astype(x.dtype)) for x in given[:2]
+        )
+        moved.append(ants.steps_in_c(task, ants.Given(qpos, qvel, given.action))[0])
+    print(f"\n{task}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more")
+    assert (touches > 0).mean() > 0.1
+    for what in ("observation", "reward"):
+        right = getattr(truth, what).reshape(len(touches), -1)
+        error, *ulps = (relative_error(getattr(of, what).reshape(right.shape), right) for of in (found, *moved))
+        ulp = np.maximum.reduce(ulps)
+        print(what, *(f"{np.quantile(of, share):.1e}" for of in (error, ulp) for share in (0.5, 0.99, 1.0)))
+        assert np.quantile(error, 0.99) <= TIMES * (ulp.max() + 1e-6), what
+    at_the_edge = np.any([of.done != truth.done for of in moved], axis=0)
+    np.testing.assert_array_equal(found.done[~at_the_edge], truth.done[~at_the_edge])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_begins_as_with_springs(task: str):
+    """With the same positions and velocities of the joints, so both physics, and both sizes, can be compared."""
+    keys = ants.stream_keys(0, ants.Domain.TRAINING_RESET, 0, np.arange(16))
+    spring, ours = (make_environment(task, {"physics": physics}) for physics in ("spring", "mujoco"))
+    of_spring, of_ours = (ants.compile_kernel(one.reset, keys[0])(keys) for one in (spring, ours))
+    assert isinstance(of_ours, MujocoAntState)
+    np.testing.assert_array_equal(of_ours.q, of_spring.q)
+    np.testing.assert_array_equal(of_ours.qd, of_spring.qd)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_environment_in_c_is_found_by_its_name_and_begins_with_the_noise_of_a_key(task: str):
+    """Certification draws starts from keys in both tasks."""
+    name = f"gymnasium:es_service/{''.join(map(str.capitalize, task.split('_')))}Mujoco-v0"
+    found = describe_environment(name, {"descriptor": "descriptor"})
+    shipped = SHIPPED[task]
+    same = ("observation_size", "action_size", "episode_steps")
+    assert [getattr(found, key) for key in same] == [getattr(shipped, key) for key in same]
+    (key,) = ants.stream_keys(0, ants.Domain.TRAINING_RESET, 0, np.arange(1))
+    first = HostEnvironment(make_host_task(name, {})).reset(0, key)
+    state = ants.resets(task, 1)
+    np.testing.assert_allclose(
+        first, jax.vmap(make_environment(task, {"physics": "mujoco"}).observe)(state)[0], atol=1e-6
+    )
+
+
+def driven_at_walls(task: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places beside walls [N, 2] and velocities of 6 m/s towards these [N, 2]."""
+    rng = np.random.default_rng(3)
+    places, ways = zip(*(ants.beside_walls(task, rng) for _ in range(count)), strict=True)
+    return np.array(places, np.float32), 6.0 * np.array(ways, np.float32)
+
+
+def torques(step: int, count: int) -> np.ndarray:
+    """[N, 8] full torques, which turn round every five steps."""
+    return np.random.default_rng(step // 5).choice(np.array([-1, 1], np.float32), (count, 8))
+
+
+def test_no_ant_gets_through_a_wall_in_c_mujoco():
+    """60 episodes with full torques, thrown at walls."""
+    for task in TASKS:
+        environment, box_W_4, nearest = ants.ENVIRONMENTS[task](), ants.boxes(task), []
+        for number, (place, way) in enumerate(zip(*driven_at_walls(task, 30), strict=True)):
+            environment.reset(seed=number)
+            environment.data.qpos[:2], environment.data.qvel[:2] = place, way
+            for step in range(40):
+                environment.step(torques(step, 30)[number])
+                nearest.append(ants.apart(environment.data.qpos[:2], box_W_4))
+        check_torsos(np.array(nearest))
+
+
+def check_torsos(apart: np.ndarray) -> None:
+    """Torsos, of radius 0.25 m, come to walls, and give way by less than 0.1 m: so none crosses one, which is 1 m
+    thick, since in a step an ant moves by less."""
+    print("\nleast distance of a torso's middle from a wall", apart.min())
+    assert np.isfinite(apart).all()
+    assert 0.15 < apart.min() < 0.3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("task", TASKS)
+def test_no_ant_gets_through_a_wall(task: str):
+    """2,000 episodes of 300 steps with full torques, thrown at walls, by simd."""
+    count = 2000
+    box_W_4, kernel, state = ants.boxes(task), ants.kernel_of(task), ants.resets(task, count)
+    qpos, qvel = state.q.copy(), state.qd.copy()
+    qpos[:, :2], qvel[:, :2] = driven_at_walls(task, count)
+    state, nearest = ants.put(state, qpos, qvel), []
+    for step in range(300):
+        before = state.q
+        state, *_ = kernel(state, torques(step, count))
+        assert np.linalg.norm((state.q - before)[:, :2], axis=1).max() < 1.0
+        beyond = np.abs(state.q[:, None, :2] - box_W_4[:, :2]) - box_W_4[:, 2:]
+        outside = np.linalg.norm(beyond.clip(0), axis=2)
+        nearest.append((outside + beyond.max(axis=2).clip(max=0)).min(axis=1))
+    check_torsos(np.array(nearest))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_replays_show_the_bodies_and_the_walls_as_high_as_those_of_springs(task: str):
+    environment = make_environment(task, {"physics": "mujoco"})
+    assert environment.viewer is not None
+    shown = scene(environment.viewer).shapes
+    boxes = [shape for shape in shown if shape.kind == "box"]
+    assert [shape.size[2] for shape in boxes] == [0.5] * len(ants.boxes(task))
+    assert [shape.position[2] for shape in boxes] == [0.5] * len(boxes)
+    assert sum(shape.kind == "capsule" for shape in shown) == 12
+    state = jax.tree.map(lambda x: jnp.asarray(x[0]), ants.resets(task, 1))
+    poses = environment.viewer.poses(state)
+    data = mujoco.MjData(environment.viewer.model)
+    data.qpos[:] = state.q
+    mujoco.mj_kinematics(environment.viewer.model, data)
+    np.testing.assert_allclose(poses.pos, data.xpos[1:], atol=1e-5)
+    np.testing.assert_allclose(poses.rot, data.xquat[1:], atol=1e-5)
+
+
+def test_walls_are_parallel_to_an_axis():
+    with pytest.raises(ValueError, match="parallel to an axis"):
+        ant_model.boxes_of((((0.0, 0.0), (1.0, 1.0)),))
+
+
+def test_without_gymnasium_its_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(TaskError, match=r"pip install 'es-service\[gymnasium\]'"):
+        make_environment("ant_trap", {"physics": "mujoco"})
