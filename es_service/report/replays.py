@@ -210,24 +210,31 @@ def _solid(data: RunData, replays: Sequence[Replay], scene: Scene) -> dict[str, 
             "rotations": packed(poses[..., 3:] * 32767.0, "int16"),
         }
     first = _poses(replays[0])
+    reach, goal = reach_of(first, scene), data.task.goal
     floors = [shape.position[2] for shape in scene.shapes if is_floor(shape)]
     return flat | {
         "solid": True,
         "step_s": scene.step_s,
         "links": first.shape[1],
         "followed": followed_link(first),
-        "reach": reach_of(first, scene),
+        "reach": reach,
         "floor": max(floors) if floors else None,
         "ground": max(floors) if floors else float(min(_poses(replay)[..., 2].min() for replay in replays)),
         "shapes": [{**shape._asdict(), "floor": is_floor(shape)} for shape in scene.shapes],
         "meshes": [packed_mesh(mesh) for mesh in scene.meshes],
-        "goal": None if data.task.goal is None else list(data.task.goal),
+        "goal": None if goal is None else list(goal),
+        "goal_radius": 0.0 if goal is None else goal_radius(goal, first[0, followed_link(first), :2], reach),
     }
 
 
 def _poses(replay: Replay) -> np.ndarray:
     """[T, L, 7] poses in double precision; 0 where they are not finite."""
     return np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64))
+
+
+def goal_radius(goal: Sequence[float], start_2: np.ndarray, reach: float) -> float:
+    """Metres of the mark of a goal: seen from far where the way is long, and small beside an arm that reaches it."""
+    return float(np.clip(0.0135 * np.hypot(*(np.asarray(goal) - start_2)), 0.06 * reach, 0.65 * reach))
 
 
 def packed_mesh(mesh: Mesh) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from es_service import api
 from es_service.errors import NotInRunError
 from es_service.loop import finished
 from es_service.protocol.recordings import Mesh, Scene, Shape
-from es_service.report.replays import followed_link, is_floor, packed_mesh, reach_of
+from es_service.report.replays import followed_link, goal_radius, is_floor, packed_mesh, reach_of
 from es_service.report.write import write_report
 from es_service.runs.certification import certify_run
 from es_service.runs.replay import record
@@ -172,6 +172,13 @@ def test_the_camera_follows_what_moves_from_as_far_as_it_reaches():
     turns = poses_T_L_7[:1].repeat(3, axis=0)
     turns[:, 2, 3:] = (1.0, 0.0, 0.0, 0.0), (0.8, 0.6, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)
     assert followed_link(turns) == 2
+
+
+def test_the_mark_of_a_goal_is_small_beside_an_arm_and_seen_from_afar():
+    start_2 = np.zeros(2)
+    assert goal_radius((0.5, 0.0), start_2, 1.0) == pytest.approx(0.06)
+    assert 0.7 < goal_radius((60.0, 0.0), start_2, 1.2) < 0.8
+    assert goal_radius((1e4, 0.0), start_2, 1.2) == pytest.approx(0.78)
 
 
 def test_a_floor_is_a_plane_of_the_world_that_looks_up():

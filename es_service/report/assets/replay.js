@@ -81,7 +81,7 @@ window.report.start.replay = () => {
       (shape.link < 0 ? scene : links[shape.link]).add(mesh);
     }
     if (data.goal) {
-      const radius = 0.65 * data.reach, height = 0.08 * data.reach;
+      const radius = data.goal_radius, height = 0.1 * radius;
       const goal = new T.Mesh(new T.CylinderGeometry(radius, radius, height, 32).rotateX(Math.PI / 2), new T.MeshLambertMaterial({ color: colour("--goal") }));
       goal.position.set(data.goal[0], data.goal[1], data.ground + 0.5 * height);
       scene.add(goal);
