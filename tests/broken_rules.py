@@ -161,7 +161,7 @@ MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/sea
 RECIPES = "es_service/protocol/recipes.py"
 KEPT_PARENTS = "es_service/protocol/kept_parents.py"
 ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
-BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
+BEHAVIOUR_MAP, ARRAYS = "es_service/search/maps/behaviour_map.py", "es_service/loop/arrays.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
 ENGINE, DEADLINES = "es_service/dispatch/engine.py", "es_service/dispatch/deadlines.py"
@@ -179,7 +179,7 @@ OF_ME_ES, OF_RULES = "tests/laws/test_me_es.py", "tests/laws/test_update_rules.p
 OF_MAP_ELITES = "tests/laws/test_map_elites.py"
 KEPT, MEASURED = "es_service/search/maps/kept.py", "es_service/search/algorithms/measured.py"
 OF_MEASURED = "tests/laws/test_measured_elites.py"
-OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py"
+OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py tests/es_service/test_arrays.py"
 OF_ROLLOUT = "tests/workers/test_rollout.py"
 OF_SCHEDULER = "tests/es_service/test_scheduler.py tests/es_service/test_scheduler_workers.py"
 
@@ -252,14 +252,25 @@ CASES = [
         "Adam moments after resume",
         f"{OF_NOVELTY_SEARCH}::test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_written"
         f" {OF_ME_ES}::test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one",
-        ("the first is lost", PARTS, "step = {name: values for", 'step = {name: values * (name != "adam_m_D") for'),
+        (
+            "the first is lost",
+            ARRAYS,
+            "{**nodes.get(path, {}),",
+            '{**{name: array * (name != "adam_m_D") for name, array in nodes.get(path, {}).items()},',
+        ),
         (
             "the second is stored as the first",
-            PARTS,
-            "**centre.step,",
-            '**{**centre.step, "adam_v_D": centre.step["adam_m_D"]},',
+            ARRAYS,
+            "for name, value in _children(owner).items()\n        if value",
+            'for name, value in {**_children(owner), **{"adam_v_D": dict(_children(owner)).get("adam_m_D")}}.items()\n'
+            "        if value",
         ),
-        ("the steps are lost", PARTS, "step = {name: values for", 'step = {name: values * (name != "adam_step") for'),
+        (
+            "the steps are lost",
+            ARRAYS,
+            "{**nodes.get(path, {}),",
+            '{**{name: array * (name != "adam_step") for name, array in nodes.get(path, {}).items()},',
+        ),
     ),
     *cases(
         "action noise",
@@ -506,8 +517,8 @@ CASES = [
         (
             "keeps only its first sample of the median",
             MEASURED,
-            '[-MOST_SAMPLES:].copy(), "descriptor_S_B"',
-            '[:1].copy(), "descriptor_S_B"',
+            "return fitness_S[-MOST_SAMPLES:]",
+            "return fitness_S[:1]",
         ),
         ("gives no score to its elite", MEASURED, "score_K[at] = score", "pass"),
     ),
@@ -519,7 +530,7 @@ CASES = [
             "have the stored places",
             "es_service/loop/correction.py",
             "doubles(results.descriptor).mean(axis=1)[valid_N]",
-            "map_.descriptor_N_B[first : first + len(cells)][valid_N]",
+            "map_.descriptor_N_B[rows][valid_N]",
         ),
     ),
     *cases(
@@ -555,9 +566,25 @@ CASES = [
             "(_with(map_, row, entry) if enters",
             '(_with(map_, row, {**entry, "fitness_N": map_.fitness_N[row]}) if enters',
         ),
-        ("is not stored when it changes", BEHAVIOUR_MAP, "for name in now:", 'for name in now.keys() - {"fitness_N"}:'),
-        ("is stored as its score", PARTS, '"fitness": map_.fitness_N[row]', '"fitness": map_.score_N[row]'),
-        ("is read from its score", PARTS, 'column("fitness", np.float64)', 'column("score", np.float64)'),
+        (
+            "is not stored when it changes",
+            ARRAYS,
+            "then[name]) for name in now])",
+            'then[name]) for name in now if name != "fitness_N"])',
+        ),
+        (
+            "is stored as its score",
+            ARRAYS,
+            "for name, value in _children(owner).items()\n        if value",
+            'for name, value in {**_children(owner), "fitness_N": getattr(owner, "score_N", None)}.items()\n'
+            "        if value",
+        ),
+        (
+            "is read from its score",
+            ARRAYS,
+            '_or_none(hints[name], nodes, f"{path}/{name}")',
+            '_or_none(hints[name], nodes, f"{path}/{name}".replace("fitness_N", "score_N"))',
+        ),
         (
             "is that of its best episode",
             "es_service/loop/evaluated.py",
@@ -679,7 +706,7 @@ CASES = [
         (
             "decides whether a run is over",
             "es_service/runs/certified.py",
-            "if policy.decides is not False and policy.episodes.count",
+            "if policy.decides and policy.episodes.count",
             "if policy.episodes.count",
         ),
     ),

@@ -16,9 +16,12 @@ import pytest
 
 from es_service.dispatch.events import Limits
 from es_service.errors import Interrupted
+from es_service.loop.arrays import MAP, joined, value_of
+from es_service.loop.contents import elite_of
 from es_service.loop.history import NO_INTEGER
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from workers.recording import record
 from workers.worker import make_worker
 
@@ -148,25 +151,38 @@ def rows_of(table: Mapping[str, np.ndarray]) -> list[dict]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
+def map_of(parts: Mapping[str, Mapping[str, np.ndarray]]) -> BehaviourMap:
+    """The behaviour map of a state in parts."""
+    return value_of(BehaviourMap, joined(parts), MAP)
+
+
 class MemoryStore:
     """A run store in memory, for driver tests that are not about the store."""
 
     def __init__(self) -> None:
         self.generation: int | None = None
         self.parts: dict[str, dict[str, np.ndarray]] = {}
+        self.contents: dict[bytes, dict[str, np.ndarray]] = {}
         self.rows: list[dict] = []
 
-    def load(self, without: str | None = None) -> dict[str, dict[str, np.ndarray]]:
-        return {name: part for name, part in self.parts.items() if without is None or not name.startswith(without)}
+    def load(self) -> dict[str, dict[str, np.ndarray]]:
+        return dict(self.parts)
 
-    def part(self, name: str) -> dict[str, np.ndarray]:
-        return self.parts[name]
+    def content(self, name: bytes) -> dict[str, np.ndarray]:
+        return self.contents[name]
+
+    def elite(self, cell: int, parts: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> Elite:
+        """The elite of a filled cell, as it is stored, in the newest state or in that of some parts."""
+        map_ = map_of(self.parts if parts is None else parts)
+        row = map_.row_of(cell)
+        return elite_of(*(self.contents[names[row].tobytes()] for names in (map_.policy_N, map_.trace_N)))
 
     def newest_history(self, count: int) -> list[dict]:
         return self.rows[-count:]
 
-    def commit(self, generation, parts, history, evaluations) -> None:
+    def commit(self, generation, parts, history, evaluations, contents) -> None:
         self.generation = generation
+        self.contents |= contents
         self.parts = {name: part for name, part in (self.parts | parts).items() if part is not None}
         self.rows.append(dict(history))
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from es_service.config.workload import policy_spec
-from es_service.loop.changes import changed_parts
+from es_service.loop.arrays import stored
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.loop.state import Best, RunState
+from es_service.protocol.content import NAME, name_of, names, policy_content
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Moments, TaskSpec
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite
+from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.maps.geometry import Geometry, Grid, make_geometry
 from es_service.search.novelty import archive_of
 from es_service.search.steps import fresh_state
@@ -70,7 +71,11 @@ def write_run(
     rows[-1]["invalid_members"] = invalid
     centre_D = rng.normal(size=shape.parameters).astype(np.float32)
     size = task.observation_size
-    nothing_O, ones_O = np.zeros(size, np.float32), np.ones(size, np.float32)
+    policy = policy_content(shape, centre_D, np.zeros(size, np.float32), np.ones(size, np.float32))
+    traces = [] if map_ is None else [{"trace_T_B": _path(end_B, rng)} for end_B in map_.descriptor_N_B]
+    if map_ is not None:
+        named = {"policy_N": names([name_of(policy)] * map_.size), "trace_N": names(map(name_of, traces))}
+        map_ = replace(map_, **named)
     state = RunState(
         generation=generations,
         search=SearchState(
@@ -80,20 +85,15 @@ def write_run(
             map_,
         ),
         observations=Moments(10.0, np.zeros(size), np.ones(size)),
-        best=Best(best, float(fitness_G[best]), centre_D, nothing_O, ones_O),
+        best=Best(best, float(fitness_G[best]), names([name_of(policy)])[0]),
         env_steps=rows[-1]["env_steps"],
         episodes=rows[-1]["episodes"],
         wall_clock_s=rows[-1]["wall_clock_s"],
-        elites={}
-        if map_ is None
-        else {
-            int(cell): Elite(centre_D, nothing_O, ones_O, _path(end_B, rng))
-            for cell, end_B in zip(map_.cell_N, map_.descriptor_N_B, strict=True)
-        },
     )
     beginning = Beginning(
         history=[{name: value for name, value in row.items() if name != "evaluated"} for row in rows],
-        parts={name: part for name, part in changed_parts(state, None).items() if part is not None},
+        parts=stored(state),
+        contents={name_of(content): content for content in (policy, *traces)},
         platforms=[(0, dict(platform_info()))],
         newest=generations,
         evaluations=[row["evaluated"] for row in rows],
@@ -185,8 +185,9 @@ def _filled(geometry: Geometry, share: float, rng: np.random.Generator) -> Behav
     else:
         descriptor_N_B = geometry.centroid_C_B[cells]
     fitness_N = -200.0 + 180.0 * rng.uniform(size=cells.size)
-    zeros = np.zeros(cells.size, np.int64)
-    return BehaviourMap(geometry, cells.astype(np.int64), fitness_N, descriptor_N_B, zeros, zeros, fitness_N)
+    zeros, none = np.zeros(cells.size, np.int64), np.zeros(cells.size, NAME)
+    columns = (fitness_N, descriptor_N_B, zeros, zeros, fitness_N, none, none)
+    return BehaviourMap(geometry, cells.astype(np.int64), *columns)
 
 
 def _path(end_B: np.ndarray, rng: np.random.Generator) -> np.ndarray:

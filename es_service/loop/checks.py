@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.text import one_of
-from es_service.errors import EvaluationError, WayOut
+from es_service.errors import EvaluationError, StoreError, WayOut
+from es_service.loop.arrays import names_of, stored
+from es_service.loop.state import RunState
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import Centre, EpisodesResult
 from es_service.protocol.recipes import Recipes
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
+from es_service.search.arrays import problem as problem_of_extra
+from es_service.search.maps.behaviour_map import COLUMNS, BehaviourMap
 
 LEARNING_RATE = "search.step.learning_rate"
-SHOWN_CELLS = 5
-"""Most cells that a message names."""
 
 
 def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation_size: int, generation: int) -> None:
@@ -64,30 +66,15 @@ def require_start_cells(cells: object, state: SearchState, generation: int) -> d
     if not all(_is_index(index, len(state.centres)) for index in cells):
         what = f"names the centres {list(cells)}; the indices of centres are 0 to {len(state.centres) - 1}"
         raise _wrong("start_cells", what, generation)
-    named = require_parents(list(cells.values()), state, generation, "start_cells")
-    return {int(index): cell for index, cell in zip(cells, named, strict=True)}
-
-
-def require_parents(cells: object, state: SearchState, generation: int, function: str = "parents") -> list[int]:
-    """Cells whose elites a search needs.
-
-    Raises:
-        EvaluationError: a search, a user's perhaps, names something else than filled cells.
-    """
-    try:
-        cell_N = np.asarray(cells)
-    except ValueError:  # sequences of different lengths
-        cell_N = np.zeros((), object)
-    are_whole = cell_N.ndim == 1 and (not cell_N.size or cell_N.dtype.kind in "iu")
-    if not isinstance(cells, Sequence | np.ndarray) or not are_whole:
-        what = f"returned {cells!r} as cells; it must return whole numbers, such as those of `map.cell_N`"
-        raise _wrong(function, what, generation)
+    if not all(isinstance(cell, int | np.integer) and not isinstance(cell, bool) for cell in cells.values()):
+        what = f"returned {list(cells.values())} as cells; it must return whole numbers, such as those of `map.cell_N`"
+        raise _wrong("start_cells", what, generation)
     filled = state.map.cell_N if state.map is not None else np.zeros(0, np.int64)
-    if missing := cell_N[~np.isin(cell_N, filled)].tolist():
+    if missing := [int(cell) for cell in cells.values() if cell not in filled]:
         there = f"{filled.size} cells of the map have one" if state.map is not None else "the run has no map"
-        named = ", ".join(map(str, missing[:SHOWN_CELLS])) + (" ..." if len(missing) > SHOWN_CELLS else "")
-        raise _wrong(function, f"names the cells {named}, which have no elite; {there}", generation)
-    return cell_N.tolist()
+        named = ", ".join(map(str, missing))
+        raise _wrong("start_cells", f"names the cells {named}, which have no elite; {there}", generation)
+    return {int(index): int(cell) for index, cell in cells.items()}
 
 
 def require_state(state: object, function: str, generation: int, centre: int | None = None, size: int = 0) -> None:
@@ -262,4 +249,88 @@ def require_finite(centres: Sequence[Centre], search: SearchConfig, generation: 
                 settings={LEARNING_RATE: learning_rate / 10},
             )
         ],
+    )
+
+
+def require_storable(state: RunState, before: RunState | None) -> None:
+    """Raise StoreError if the search's state is none that can be stored.
+
+    Args:
+        before: one that is; what is the same object in it is not looked at again.
+    """
+    if wrong := _malformed(state.search, None if before is None else before.search):
+        raise _refusal(state.generation, wrong)
+
+
+def _malformed(search: SearchState, earlier: SearchState | None) -> str:
+    """What of a search's state is none that can be stored; empty if all is."""
+    if not search.centres:
+        return "the search has no centre; one must remain"
+    if wrong := _malformed_centres(search, earlier):
+        return wrong
+    if earlier is not None and (search.map is None) != (earlier.map is None):
+        return "the behaviour map was added or removed, which only `map.enabled` decides"
+    if (earlier is None or search.extra is not earlier.extra) and (
+        wrong := problem_of_extra(search.extra, earlier.extra if earlier is not None else {})
+    ):
+        return wrong
+    return ""
+
+
+def _malformed_centres(search: SearchState, earlier: SearchState | None) -> str:
+    """Which new centre is none from which a generation could go on; empty if none is."""
+    known = earlier.centres if earlier is not None else ()
+    shape = (known or search.centres)[0].centre_D.shape
+    for index, centre in enumerate(search.centres):
+        if index < len(known) and centre is known[index]:
+            continue
+        centre_D = centre.centre_D
+        if not isinstance(centre_D, np.ndarray) or centre_D.dtype != np.float32 or centre_D.shape != shape:
+            now = f"{centre_D.dtype} {centre_D.shape}" if isinstance(centre_D, np.ndarray) else type(centre_D).__name__
+            return f"centre {index} is {now}; it must be float32 {shape}"
+        if not np.isfinite(centre_D).all():
+            return f"centre {index} has {np.count_nonzero(~np.isfinite(centre_D))} values that are not finite"
+    return ""
+
+
+def _malformed_map(map_: BehaviourMap, before: BehaviourMap | None) -> str:
+    """Which array of a map has another type, shape or content than its cells need; empty if none has."""
+    needed = {"cell_N": "i8", **COLUMNS, **({} if map_.samples_N is None else {"samples_N": "i8"})}
+    for name, type_ in needed.items():
+        array = getattr(map_, name)
+        shape = (map_.size, len(map_.geometry.bounds)) if name == "descriptor_N_B" else (map_.size,)
+        if not isinstance(array, np.ndarray) or array.dtype != type_ or array.shape != shape:
+            now = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            return f"the map's {name} is {now}; it must be {np.dtype(type_)} {shape}"
+    cells = map_.cell_N if before is None or map_.cell_N is not before.cell_N else map_.cell_N[:0]
+    if len(np.unique(cells)) < len(cells) or not ((cells >= 0) & (cells < map_.geometry.size)).all():
+        return f"the map's cells must be different ones from 0 to {map_.geometry.size - 1}"
+    return ""
+
+
+def require_known(named: Collection[bytes], before: RunState | None, generation: int) -> None:
+    """Raise StoreError if a state names a policy that was neither evaluated now nor named by the state before.
+
+    Args:
+        named: names of those that were not evaluated now.
+    """
+    if unknown := set(named).difference(() if before is None or not named else names_of(stored(before))):
+        name = min(unknown).hex()
+        raise _refusal(generation, f"it names the policy {name}, which was neither evaluated now nor named before")
+
+
+def require_columns(search: SearchState, before: SearchState, generation: int) -> None:
+    """Raise StoreError if the arrays of a map are none that can be stored; `before` is what can."""
+    map_before = before.map
+    if search.map is None or search.map is map_before:
+        return
+    if wrong := _malformed_map(search.map, map_before):
+        raise _refusal(generation, wrong)
+
+
+def _refusal(generation: int, why: str) -> StoreError:
+    saved = f" Everything up to generation {generation - 1} is saved." if generation else ""
+    return StoreError(
+        f"generation {generation} cannot be stored: {why}; the class SearchState in "
+        f"es_service/search/algorithms/base.py describes what a state is.{saved}"
     )

@@ -9,7 +9,7 @@ step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -18,20 +18,21 @@ import numpy as np
 
 from es_service.config.model import BudgetConfig
 from es_service.config.search import PopulationConfig
+from es_service.config.workload import policy_spec
 from es_service.loop import budget as budgets
+from es_service.loop.arrays import state_of
 from es_service.loop.checks import (
     invalidate,
     require_asks,
     require_finite,
-    require_parents,
     require_some_finite,
     require_start_cells,
     require_state,
     require_weights,
 )
 from es_service.loop.clock import Clock
+from es_service.loop.contents import Contents, Named
 from es_service.loop.correction import correct
-from es_service.loop.elites import Elites
 from es_service.loop.evaluated import (
     Evaluations,
     Proposal,
@@ -53,11 +54,10 @@ from es_service.loop.generation import (
 )
 from es_service.loop.history import HistoryRow
 from es_service.loop.interfaces import Search, Stop, Store, Stored
-from es_service.loop.parts import ELITE_PREFIX, state_from_parts
 from es_service.loop.policies import as_population
 from es_service.loop.state import RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator, Requests, Session, Value
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
+from es_service.protocol.messages import Centre, EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, SearchState
 from es_service.search.novelty import novelty
 
@@ -90,7 +90,7 @@ def run(
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
     state = state or initial_state(search)
     reachable = reachable_in(search, state)
-    elites = Elites(store.part)
+    policies = Contents(store.content)
     finished: list[Finished] = []
 
     def record() -> str | None:
@@ -104,15 +104,14 @@ def run(
             failed(newest.failures)
         row, table = rows(search, newest, reachable)
         clock.lap("seconds_driver")
-        store.commit(newest.state.generation, newest.parts, row, table)
-        elites.stored()
+        store.commit(newest.state.generation, newest.parts, row, table, newest.contents)
         clock.lap("seconds_store")
         answer = report(row)
         clock.lap("seconds_driver")
         return answer.reason if isinstance(answer, Stop) else None
 
     while (reason := spent(search.config.budget, state)) is None:
-        requests = generation(search, elites, store.part, clock, state, counts)
+        requests = generation(search, policies, clock, state, counts)
         results: Any = None
         try:
             while True:
@@ -151,14 +150,13 @@ def drive(session: Session[Value], evaluator: Evaluator) -> Value:
             results = wait()
 
 
-def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
-    """The newest state in the store, without the elites' policies; None before the first generation."""
+def stored_state(store: Stored) -> RunState | None:
+    """The newest state in the store; None before the first generation."""
     if store.generation is None:
         return None
     rows = store.newest_history(budgets.MOST_DURATIONS)
     seconds = float(rows[-1]["wall_clock_s"] or 0.0) if rows else 0.0
-    state = state_from_parts(store.load(without=ELITE_PREFIX), store.generation, seconds, len(task.descriptor_names))
-    return replace(state, durations=budgets.durations(rows))
+    return replace(state_of(store.load(), store.generation, seconds), durations=budgets.durations(rows))
 
 
 def spent(budget: BudgetConfig, state: RunState) -> str | None:
@@ -183,31 +181,31 @@ def _reached(state: RunState) -> dict[str, float]:
 
 def generation(
     search: Search,
-    elites: Elites,
-    stored: Callable[[str], Mapping[str, np.ndarray]],
+    policies: Contents,
     clock: Clock,
     state: RunState,
     counts: Callable[[], DispatchCounts] = DispatchCounts,
 ) -> Requests[Finished]:
-    """One generation, which asks for what it needs computed: a pure function of (search, state, elites, results) but
-    for its timings.
+    """One generation, which asks for what it needs computed: a pure function of (search, state, stored policies,
+    results) but for its timings.
 
     It may ask for several populations, and for policies. Each request has all of them side by side; results are taken
     in ask order.
 
     Args:
-        elites, stored: the policies of the map and the parts of `state`, as they are stored.
+        policies: those that `state` names; gets those of this generation.
         state: the state before it.
         counts: as in `run`.
     """
     since = counts() if state.generation >= 0 else DispatchCounts()
-    proposal = propose(search, elites, state)
+    proposal = propose(search, policies, state)
     clock.lap("seconds_driver")
     evaluations = yield from evaluate(search, proposal)
     clock.lap("seconds_rollout")
     updated = yield from update(search, proposal, evaluations, clock)
+    policies.add(updated.contents)
     clock.lap("seconds_driver")
-    correction = yield from correct(search, elites, state, updated)
+    correction = yield from correct(search, policies.policies, updated)
     clock.lap("seconds_evaluation")
     now = counts()
     faults: HistoryRow = {
@@ -215,12 +213,10 @@ def generation(
         "lost_workers": now.lost_workers - since.lost_workers,
         "workers": now.workers,
     }
-    finished = finish(state, proposal, evaluations, updated, correction, faults, stored, search, clock)
-    elites.change(finished.parts)
-    return finished
+    return finish(state, proposal, evaluations, updated, correction, faults, search, clock)
 
 
-def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
+def propose(search: Search, policies: Contents, state: RunState) -> Proposal:
     """What the next generation evaluates: centres restart from elites, and the search asks."""
     config, algorithm, generation = search.config, search.algorithm, state.generation + 1
     begun = state.search
@@ -230,18 +226,23 @@ def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
     size = begun.centres[0].centre_D.size
     start_cells = require_start_cells(algorithm.start_cells(begun, generation), begun, generation)
     for index, cell in start_cells.items():
-        begun = algorithm.restart(begun, index, cell, elites(cell))
+        begun = algorithm.restart(begun, index, cell, policies.elite(_policy_of(begun, cell)))
         require_state(begun, "restart", generation, index, size)
-    parents = elites.of(require_parents(algorithm.parents(begun, generation), begun, generation))
-    asked = algorithm.ask(replace(begun, elites=parents), generation)
+    asked: Any = policies.completed(algorithm.ask(begun, generation), generation)
     require_asks(asked, begun, config.compute.chunk_pairs, search.task.observation_size, generation)
     points = [
         make_centre(config, generation, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
         for ask in asked
         if isinstance(ask, Ask)
     ]
-    policies = policies_asked(config, search.task, generation, asked)
-    return Proposal(generation, begun, start_cells, asked, points, policies)
+    work = policies_asked(config, search.task, generation, asked)
+    return Proposal(generation, begun, start_cells, asked, points, work)
+
+
+def _policy_of(state: SearchState, cell: int) -> bytes:
+    """Name of the policy of a filled cell."""
+    assert state.map is not None
+    return state.map.policy_N[state.map.row_of(cell)].tobytes()
 
 
 def evaluate(search: Search, proposal: Proposal) -> Requests[Evaluations]:
@@ -280,12 +281,13 @@ def update(search: Search, proposal: Proposal, evaluations: Evaluations, clock: 
             centres=len(proposal.search.centres),
             fitness_weight=proposal.search.weight.value,
         )
-    told = told_of(evaluated, generation)
+    named = Named(evaluated, policy_spec(config, search.task))
+    told = told_of(evaluated, generation, named.names)
     learned = tell(algorithm, stepped, told)
     novelty_N = np.full(len(told), np.nan)
     if proposal.asked:
         novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(config.novelty))
-    return Update(learned, evaluated, told, novelty_N)
+    return Update(learned, evaluated, told, novelty_N, named.contents)
 
 
 def _step(

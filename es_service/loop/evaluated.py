@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,10 @@ from es_service.loop.checks import valid_members
 from es_service.loop.generation import first_episode, highest, steps_of
 from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, with_gaps
 from es_service.loop.policies import PolicyWork, no_statistics, policy_work
+from es_service.protocol.content import Arrays
 from es_service.protocol.episodes import joined
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
+from es_service.protocol.recipes import Recipes, remember
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.maps.behaviour_map import EMPTY
 from es_service.search.steps.clipup import norm
@@ -55,6 +58,16 @@ class Evaluated:
                 points |= zip(here, subject.policies([row - first for row in here]), strict=True)
             first = end
         return [points[row] for row in rows]
+
+    def remember(self, rows: Sequence[int], names: Sequence[bytes]) -> None:
+        """Remember how those of some rows that were made of recipes were made, by their names."""
+        first = 0
+        for subject in self.subjects:
+            end = first + (1 if isinstance(subject, Centre) else len(subject.parameters_N_D))
+            here = [(row - first, name) for row, name in zip(rows, names, strict=True) if first <= row < end]
+            if here and isinstance(subject, PolicyWork) and isinstance(subject.parameters_N_D, Recipes):
+                remember(subject.parameters_N_D.part([row for row, _ in here]), [name for _, name in here])
+            first = end
 
     def point(self, row: int) -> Centre:
         """One point."""
@@ -109,6 +122,8 @@ class Update:
     """What the search was told of each."""
     novelty_N: NDArray[np.float64]
     """Novelty of each in the archive before the generation; NaN for initial centres."""
+    contents: Mapping[bytes, Arrays] = field(default_factory=dict)
+    """Policies and traces of the generation that have got a name."""
 
 
 def policies_asked(
@@ -230,8 +245,16 @@ def _joined(parts: Sequence[Evaluated]) -> Evaluated:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid
-def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
-    """What a search is told of a generation's centres and policies."""
+def told_of(
+    evaluated: Evaluated,
+    generation: int,
+    names: Callable[[Sequence[int]], tuple[NDArray[Any], NDArray[Any]]] | None = None,
+) -> CentreEvaluations:
+    """What a search is told of a generation's centres and policies.
+
+    Args:
+        names: see `CentreEvaluations.names`.
+    """
     episodes = evaluated.evaluation
     return CentreEvaluations(
         generation,
@@ -242,7 +265,7 @@ def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
         evaluated.population_max_N,
         episodes.fitness.shape[1],
         episodes,
-        evaluated.points,
+        names,
     )
 
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.loop.arrays import Changes, changes, names_of
 from es_service.loop.budget import MOST_DURATIONS, durations
-from es_service.loop.changes import Stored, changed_parts
+from es_service.loop.checks import require_known, require_storable
 from es_service.loop.clock import Clock
 from es_service.loop.correction import Correction
 from es_service.loop.evaluated import Evaluations, Proposal, Update, evaluated_table
-from es_service.loop.generation import better, entered, fittest
+from es_service.loop.generation import better, fittest
 from es_service.loop.history import (
     HistoryRow,
     Table,
@@ -22,8 +23,8 @@ from es_service.loop.history import (
     population_columns,
 )
 from es_service.loop.interfaces import Search
-from es_service.loop.parts import Changes
 from es_service.loop.state import RunState
+from es_service.protocol.content import Contents
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.maps.geometry import reachable_cells
 from es_service.search.observation_statistics import merge_moments
@@ -41,7 +42,9 @@ class Finished:
     state: RunState
     """State after it."""
     parts: Changes
-    """What it has changed."""
+    """Blocks of arrays that it has changed."""
+    contents: Contents
+    """The policies and traces that it names and that are new."""
     cell_N: NDArray[np.int64] | None
     """Cells of which those evaluated are the elites, EMPTY for the others; None without a map."""
     proposal: Proposal
@@ -72,36 +75,35 @@ def finish(
     updated: Update,
     correction: Correction,
     faults: HistoryRow,
-    stored: Stored,
     search: Search,
     clock: Clock,
 ) -> Finished:
-    """End a generation with the state after it.
-
-    Args:
-        before: the state before it, which is stored.
-        stored: returns a part of that state.
-    """
+    """End a generation with the state after it; `before` is the state before it, which is stored."""
     generation, learned, evaluated = proposal.generation, updated.search, updated.evaluated
     results, per_member = evaluated.evaluation, search.config.task.episodes_per_member
     episodes = sum(population.fitness.size for population in evaluations.populations) * per_member
     cell_N = None if learned.map is None else learned.map.cells_with(generation, evaluated.index_N)
     state = RunState(
         generation=generation,
-        search=replace(learned, elites={}),
+        search=learned,
         observations=merge_moments(before.observations, evaluations.observed),
-        best=better(before.best, updated.told, evaluated.point),
+        best=better(before.best, updated.told),
         env_steps=before.env_steps + int(evaluated.env_steps_N.sum()) + correction.env_steps,
         episodes=before.episodes + episodes + results.fitness.size + correction.episodes,
         wall_clock_s=clock.total(),
-        elites=entered(learned, cell_N, evaluated.points, results.trace_T_B),
     )
-    parts = changed_parts(state, before if before.generation >= 0 else None, stored)
+    stored = before if before.generation >= 0 else None
+    require_storable(state, stored)
+    parts = changes(state, stored)
+    named = names_of(parts)
+    contents = {name: content for name, content in updated.contents.items() if name in named}
+    require_known(named.difference(contents), stored, generation)
     clock.lap("seconds_driver")
     seconds, laps = clock.finish_generation()
     recent = (*before.durations, *durations([{"generation": generation, **laps}]))[-MOST_DURATIONS:]
     state = replace(state, durations=recent)
-    return Finished(before, state, parts, cell_N, proposal, evaluations, updated, correction, faults, seconds, laps)
+    computed = proposal, evaluations, updated, correction
+    return Finished(before, state, parts, contents, cell_N, *computed, faults, seconds, laps)
 
 
 def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:

@@ -1,60 +1,51 @@
-"""Whether the parts of a stored state are those that a run of these sizes writes; a stranger may have written others.
+"""Whether the arrays of a stored state are those that a run of these sizes writes; a stranger may have written others.
 
 The axes at the end of an array's name are its shape: D policy parameters, O observation, B descriptor dimensions; other
-letters are axes of any length, which arrays of a part share. What a search stores of its own is not looked at.
+letters are axes of any length, which arrays of a node share. What a search stores of its own is not looked at.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from es_service.loop.parts import (
-    BEST,
-    BLOCK_PREFIX,
-    CELL_PREFIX,
-    CENTRE_PREFIX,
-    COUNTERS,
-    ELITE_PREFIX,
-    GEOMETRY_PART,
-    OBSERVATIONS,
-    WEIGHT,
-    centre_part,
-)
-from es_service.search.state_parts import APPENDED_PREFIX, BY_CELL_PREFIX, PIECE
+from es_service.loop.arrays import ARCHIVE, BEST, BLOCK, CENTRES, COUNTS, EXTRA, GEOMETRY, MAP, OBSERVATIONS, WEIGHT
 
-INTEGER, REAL, BOOL = "iu", "f", "b"
+INTEGER, REAL, BOOL, NAMES = "iu", "f", "b", "V"
 """Kinds of a `dtype`."""
-_POLICY = {"centre_D": REAL, "observation_mean_O": REAL, "observation_std_O": REAL}
-_NUMBERED = (CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX)
+_STEP = "step"
 _KINDS: Mapping[str, Mapping[str, str]] = {
-    COUNTERS: {"env_steps": INTEGER, "episodes": INTEGER},
+    COUNTS: {"env_steps": INTEGER, "episodes": INTEGER},
     OBSERVATIONS: {"count": REAL, "mean_O": REAL, "m2_O": REAL},
     WEIGHT: {"value": REAL, "record": REAL, "stagnant": INTEGER},
-    BEST: {"generation": INTEGER, "fitness": REAL, **_POLICY},
-    GEOMETRY_PART: {"bounds_B_2": REAL},
-    CENTRE_PREFIX: {"centre_D": REAL, "entry": INTEGER, "cell": INTEGER},
-    CELL_PREFIX: {
-        **dict.fromkeys(("order", "generation", "centre"), INTEGER),
-        **dict.fromkeys(("fitness", "descriptor_B", "score"), REAL),
+    BEST: {"generation": INTEGER, "fitness": REAL, "policy": NAMES},
+    GEOMETRY: {},
+    CENTRES: {"centre_D": REAL, "entry": INTEGER, "cell": INTEGER},
+    _STEP: {},
+    MAP: {
+        **dict.fromkeys(("cell_N", "generation_N", "centre_N"), INTEGER),
+        **dict.fromkeys(("fitness_N", "descriptor_N_B", "score_N"), REAL),
+        **dict.fromkeys(("policy_N", "trace_N"), NAMES),
     },
-    ELITE_PREFIX: {**_POLICY, "trace_T_B": REAL},
-    BLOCK_PREFIX: {"descriptor_N_B": REAL, "generation_N": INTEGER, "centre_N": INTEGER},
+    ARCHIVE: {"descriptor_N_B": REAL, "generation_N": INTEGER, "centre_N": INTEGER},
 }
-"""Name of a part, or prefix of the names of numbered ones -> kinds of the arrays that it has."""
+"""Kind of a node -> kinds of the arrays that it has."""
 _MORE = {
-    GEOMETRY_PART: {"shape_B": INTEGER, "centroid_C_B": REAL, "counts_samples": BOOL},
-    CELL_PREFIX: {"samples": INTEGER},
+    GEOMETRY: {"bounds": REAL, "shape": INTEGER, "centroid_C_B": REAL},
+    MAP: {"samples_N": INTEGER},
+    CENTRES: {"own_mean_O": REAL, "own_std_O": REAL},
 }
-"""The same for arrays that it may have; a centre has any others, such as those of a user's search."""
-_ALWAYS = (COUNTERS, OBSERVATIONS, WEIGHT, BEST, centre_part(0))
+"""The same for arrays that it may have; a step has any others, such as those of a user's search."""
+POLICY: Mapping[str, str] = {"parameters_D": REAL, "observation_mean_O": REAL, "observation_std_O": REAL}
+"""Kinds of the arrays of a policy."""
+_ALWAYS = (COUNTS, OBSERVATIONS, WEIGHT, BEST, ARCHIVE, f"{CENTRES}/0")
 _ANY = "biuf"
 _AXES = re.compile("(?<=_)[A-Z0-9](?=_|$)")
-_FINITE = ("descriptor_B", "descriptor_N_B", "bounds_B_2", "centroid_C_B")
+_FINITE = ("descriptor_N_B", "bounds", "centroid_C_B")
 
 
 class Sizes(NamedTuple):
@@ -71,19 +62,35 @@ class Sizes(NamedTuple):
     step: Mapping[str, str] = {}
     """Name of an array of a centre's step -> the kinds that it may have."""
 
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Axis -> its length."""
+        return {"D": self.parameters, "O": self.observation, "B": self.dimensions}
 
-def problem(part: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
-    """In which way the content of a part is none of a run of these sizes; empty if it is one."""
-    kind = next((prefix for prefix in _NUMBERED if part.startswith(prefix)), part)
+
+def problem(name: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
+    """In which way the content of a node, or of a block of one, is none of a run of these sizes; empty if it is one."""
+    path, is_block, number = name.partition(BLOCK)
+    if is_block and not number.isdecimal():
+        return f"{name} has no number at its end"
+    kind = path
+    if path.startswith(f"{CENTRES}/"):
+        kind = _STEP if path.endswith(f"/{_STEP}") else CENTRES
     if kind not in _KINDS:
-        number = part.partition(PIECE)[2] if part.startswith((APPENDED_PREFIX, BY_CELL_PREFIX)) else ""
-        return "" if not number or number.isdecimal() else f"{part} has no number at its end"
+        return "" if path.partition("/")[0] == EXTRA else f"{name} is no part of a state"
     needed, more = _KINDS[kind], _MORE.get(kind, {})
-    if kind == CENTRE_PREFIX:
-        needed, more = {**needed, **sizes.step}, dict.fromkeys(arrays, _ANY)
-    lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions, "2": 2}
-    found = array_problem(arrays, needed, more, lengths) or _problem_of_values(part, kind, arrays, sizes)
-    return f"{part} {found}" if found else ""
+    if kind == _STEP:
+        needed, more = sizes.step, dict.fromkeys(arrays, _ANY)
+    found = array_problem(arrays, needed, more, sizes.lengths) or _problem_of_values(kind, arrays, sizes)
+    return f"{name} {found}" if found else ""
+
+
+def policy_problem(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
+    """In which way a content is neither a policy nor a trace of a run of these sizes; empty if it is one."""
+    if arrays.keys() == {"trace_T_B"}:
+        return array_problem(arrays, {"trace_T_B": REAL}, {}, sizes.lengths)
+    policy = {name: array for name, array in arrays.items() if name != "spec"}
+    return array_problem(policy, POLICY, {}, sizes.lengths)
 
 
 def array_problem(
@@ -101,7 +108,7 @@ def array_problem(
     for name, array in arrays.items():
         axes = _AXES.findall(name)
         fits = len(axes) == array.ndim and all(map(_fits, axes, array.shape, [lengths] * array.ndim))
-        if array.dtype.kind not in kinds.get(name, "") or not fits:
+        if array.dtype.kind not in kinds.get(name, "") or not (fits or name in _MORE[GEOMETRY]):
             return f"has an array {name!r} of {array.dtype} {array.shape}, which no run of these sizes has"
         if name in _FINITE and not np.isfinite(array).all():
             return f"has an array {name!r} with values that are not finite"
@@ -113,24 +120,14 @@ def _fits(axis: str, length: int, lengths: dict[str, int]) -> bool:
     return lengths.setdefault(axis, length) == length
 
 
-def _problem_of_values(part: str, kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
+def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
     """As `problem`, for what the values must be."""
     count = math.prod(sizes.cells or (0,))
-    if kind in (CELL_PREFIX, ELITE_PREFIX):
-        number = part.removeprefix(kind)
-        return "" if number.isdecimal() and int(number) < count else f"is no cell of a map of {count} cells"
-    if kind == GEOMETRY_PART:
-        shape_B, centroid_C_B = arrays.get("shape_B"), arrays.get("centroid_C_B")
-        of_grid = [] if shape_B is None else [shape_B.tolist()]
-        of_cvt = [] if centroid_C_B is None else [[len(centroid_C_B)]]
-        if of_grid + of_cvt != [list(sizes.cells or ())] or arrays["bounds_B_2"].tolist() != [*map(list, sizes.bounds)]:
-            return "has other cells or bounds than the config"
-        if centroid_C_B is not None:
-            low_B, high_B = arrays["bounds_B_2"].T
-            are_inside = ((low_B <= centroid_C_B) & (centroid_C_B <= high_B)).all()
-            if not are_inside or len(np.unique(centroid_C_B, axis=0)) < len(centroid_C_B):
-                return "has centroids outside of the bounds of the map, or twice the same"
-    if kind == CENTRE_PREFIX:
+    if kind == MAP and not ((arrays["cell_N"] >= 0) & (arrays["cell_N"] < count)).all():
+        return f"has a cell that is none of a map of {count} cells"
+    if kind == GEOMETRY:
+        return _problem_of_geometry(arrays, sizes)
+    if kind == _STEP:
         counts = {name: arrays[name] for name, kinds in sizes.step.items() if kinds == INTEGER}
         for name, array in counts.items():
             if not ((array >= 0) & (array < 2**53)).all():
@@ -140,9 +137,23 @@ def _problem_of_values(part: str, kind: str, arrays: Mapping[str, np.ndarray], s
     return ""
 
 
-def missing(parts: Collection[str], sizes: Sizes, wanted: Callable[[str], bool]) -> str:
-    """The first part that a state of these sizes has, that is `wanted`, and that is not among some; empty if there is
-    none."""
-    cells = (part.removeprefix(CELL_PREFIX) for part in parts if part.startswith(CELL_PREFIX))
-    of_map = [] if sizes.cells is None else [GEOMETRY_PART, *(ELITE_PREFIX + cell for cell in cells)]
-    return next((part for part in (*_ALWAYS, *of_map) if part not in parts and wanted(part)), "")
+def _problem_of_geometry(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
+    """As `problem`, for the cells of a map; a block of centroids has some of them."""
+    bounds, shape, centroid_C_B = (arrays.get(name) for name in ("bounds", "shape", "centroid_C_B"))
+    of_grid = [] if shape is None else [shape.tolist()]
+    of_cvt = [] if centroid_C_B is None else [[len(centroid_C_B)]]
+    if of_grid + of_cvt != [list(sizes.cells or ())] or bounds is None or bounds.tolist() != [*map(list, sizes.bounds)]:
+        return "has other cells or bounds than the config"
+    if centroid_C_B is not None:
+        low_B, high_B = bounds.T
+        are_inside = ((low_B <= centroid_C_B) & (centroid_C_B <= high_B)).all()
+        if not are_inside or len(np.unique(centroid_C_B, axis=0)) < len(centroid_C_B):
+            return "has centroids outside of the bounds of the map, or twice the same"
+    return ""
+
+
+def missing(paths: Collection[str], sizes: Sizes, wanted: Collection[str] = ("",)) -> str:
+    """The first node that a state of these sizes has, that is below one of the `wanted` paths, and that is not among
+    some; empty if there is none."""
+    needed = (*_ALWAYS, *([] if sizes.cells is None else [MAP, GEOMETRY]))
+    return next((path for path in needed if path not in paths and path.startswith(tuple(wanted))), "")

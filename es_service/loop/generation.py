@@ -7,20 +7,19 @@ fixed binary tree. Axes: P antithetic pairs, S signs [+, -], E evaluation episod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError
-from es_service.loop.checks import require_state
+from es_service.loop.checks import require_columns, require_state
 from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork
-from es_service.loop.state import Best, RunState, statistics_in_force
+from es_service.loop.state import NO_BEST, Best, RunState, statistics_in_force
 from es_service.protocol.episodes import gathered
 from es_service.protocol.evaluator import Requests
 from es_service.protocol.gradient_tree import tree_sum
@@ -40,7 +39,6 @@ from es_service.protocol.messages import (
 )
 from es_service.search.algorithms.base import (
     Algorithm,
-    CentreEvaluation,
     CentreEvaluations,
     CentreState,
     SearchState,
@@ -48,7 +46,7 @@ from es_service.search.algorithms.base import (
     with_centre,
 )
 from es_service.search.algorithms.common import first_state
-from es_service.search.maps.behaviour_map import EMPTY, Elite, empty_map, make_elite
+from es_service.search.maps.behaviour_map import empty_map, with_names
 from es_service.search.maps.geometry import make_geometry
 from es_service.search.steps.clipup import norm
 
@@ -66,9 +64,7 @@ def initial_state(search: Search) -> RunState:
     for index, (mean_O, std_O) in enumerate(search.statistics()):
         centre = replace(learned.centres[index], own_mean_O=mean_O, own_std_O=std_O)
         learned = with_centre(learned, index, centre)
-    first = make_centre(search.config, 0, centres[0], observations)
-    best = Best(0, -math.inf, centres[0], first.observation_mean_O, first.observation_std_O)
-    return RunState(-1, learned, observations, best, env_steps=0, episodes=0, wall_clock_s=0.0)
+    return RunState(-1, learned, observations, NO_BEST, env_steps=0, episodes=0, wall_clock_s=0.0)
 
 
 def make_centre(
@@ -213,14 +209,18 @@ def _computed(kind: type[Result], work: Sequence[Work]) -> Requests[list[Result]
     return checked
 
 
-def tell(algorithm: Algorithm, state: SearchState, told: Sequence[CentreEvaluation]) -> SearchState:
-    """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
-    after = algorithm.tell(state, told)
-    require_state(after, "tell", told[0].generation)
+def tell(algorithm: Algorithm, state: SearchState, told: CentreEvaluations) -> SearchState:
+    """The state after the search is told a generation's evaluations, whose new elites have their names; its arrays are
+    read-only from now on."""
+    after, generation = algorithm.tell(state, told), told.generation
+    require_state(after, "tell", generation)
+    require_columns(after, state, generation)
     try:
+        if after.map is not None and after.map is not state.map and told.names is not None:
+            after = replace(after, map=with_names(after.map, generation, told.centre_N, told.names))
         return frozen(after)
     except ValueError as error:
-        text = f"generation {told[0].generation}: `tell` returned a state that is none: {error}"
+        text = f"generation {generation}: `tell` returned a state that is none: {error}"
         raise EvaluationError(text, field="search.algorithm") from error
 
 
@@ -229,40 +229,16 @@ def fittest(told: CentreEvaluations) -> int:
     return int(np.where(told.valid_N, told.fitness_N, -math.inf).argmax())
 
 
-def entered(
-    state: SearchState,
-    cell_N: NDArray[np.int64] | None,
-    points: Callable[[Sequence[int]], Sequence[Centre]],
-    trace_N_T_B: FloatArray | None,
-) -> dict[int, Elite]:
-    """The policies of elites that the store does not have, by their cells: those of the centres just evaluated that are
-    elites now, and those that the search has given.
-
-    The map decides this and not `CentreState.cell`, which a search of the user need not set.
-
-    Args:
-        cell_N: cells of which those just evaluated are the elites, EMPTY for the others; None without a map.
-        points: function from indices in `cell_N` to what was evaluated.
-    """
-    if state.map is None or cell_N is None:
-        return {}
-    filled = set(state.map.cell_N.tolist()) if state.elites else set()
-    elites = {cell: elite for cell, elite in state.elites.items() if cell in filled}
-    rows = np.flatnonzero(cell_N != EMPTY).tolist()
-    for row, point in zip(rows, points(rows), strict=True):
-        assert trace_N_T_B is not None, "an evaluation has a trace"
-        elites[int(cell_N[row])] = make_elite(point, trace_N_T_B[row].copy())
-    return elites
-
-
-def better(best: Best, told: CentreEvaluations, point: Callable[[int], Centre]) -> Best:
-    """The best centre after more evaluations. An invalid centre, or one of equal fitness, does not replace it."""
+def better(best: Best, told: CentreEvaluations) -> Best:
+    """The best centre after more evaluations. An invalid centre, or one of equal fitness, does not replace it; the
+    first one is taken in any case."""
     at = fittest(told)
-    if not told.valid_N[at] or told.fitness_N[at] <= best.fitness:
+    is_better = told.valid_N[at] and told.fitness_N[at] > best.fitness
+    if best is not NO_BEST and not is_better:
         return best
-    centre = point(at)
-    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-    return Best(centre.generation, float(told.fitness_N[at]), centre.parameters_D, mean_O, std_O)
+    assert told.names is not None, "the loop has made these evaluations"
+    policy_N, _ = told.names([at])
+    return Best(told.generation, float(told.fitness_N[at]) if is_better else -math.inf, policy_N[0])
 
 
 def steps_of(result: EpisodesResult) -> int:

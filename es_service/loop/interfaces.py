@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
+from es_service.loop.arrays import Changes
 from es_service.loop.history import HistoryRow, Table
-from es_service.loop.parts import Arrays, Changes
+from es_service.protocol.content import Arrays, Contents
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
 from es_service.search.algorithms.base import Algorithm
 
@@ -24,17 +23,21 @@ class Stored(Protocol):
         """Newest committed generation; None before the first."""
         ...
 
-    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
+    def load(self) -> Mapping[str, Arrays]: ...
     def newest_history(self, count: int) -> Sequence[Mapping[str, Any]]: ...
 
 
 class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
-    def part(self, name: str) -> Mapping[str, np.ndarray]: ...
+    def content(self, name: bytes) -> Arrays:
+        """A policy or a trace that a stored state names. Raises KeyError if there is none of this name."""
+        ...
 
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
-        """Take a generation, whose parts `part` returns from now on."""
+    def commit(
+        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table, contents: Contents
+    ) -> None:
+        """Take a generation, with the policies and traces that it names and no generation before."""
         ...
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
-from es_service.protocol.recipes import Recipes, remember
+from es_service.protocol.recipes import Recipes
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,7 @@ class PolicyWork:
             return [self.parameters_N_D[number].copy() for number in numbers]
         if missing := [number for number in dict.fromkeys(numbers) if number not in self._made]:
             recipes = self.parameters_N_D.part(missing)
-            made = [parameters_D.copy() for parameters_D in recipes.made()]
-            remember(recipes, made)
-            self._made.update(zip(missing, made, strict=True))
+            self._made.update(zip(missing, (parameters_D.copy() for parameters_D in recipes.made()), strict=True))
         return [self._made[number] for number in numbers]
 
 

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.content import NAME
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.search.algorithms.base import CentreState, SearchState
-from es_service.search.maps.behaviour_map import Elite
 from es_service.search.observation_statistics import normalisation
 
 
 @dataclass(frozen=True)
 class Best:
-    """The centre with the highest mean fitness so far, and the observation statistics used in its evaluation."""
+    """The centre with the highest mean fitness so far, with the observation statistics of its evaluation."""
 
     generation: int
     fitness: float
-    centre_D: FloatArray
-    observation_mean_O: FloatArray
-    observation_std_O: FloatArray
+    policy: NDArray[Any]
+    """Its name."""
+
+
+NO_BEST = Best(0, -math.inf, np.zeros((), NAME))
+"""Before the first generation."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +42,6 @@ class RunState:
     episodes: int
     wall_clock_s: float
     """Seconds spent so far in all sessions. They are stored only in the history, because they are not deterministic."""
-    elites: Mapping[int, Elite] = field(default_factory=dict)
-    """Policies of elites that entered the map in this generation, by cell; the others are only in the store."""
     durations: tuple[float, ...] = ()
     """`budget.durations` of the newest generations."""
 

@@ -14,11 +14,12 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.content import NAME, as_bytes
 from es_service.protocol.noise import KEY_WORDS, Keys, normals
 
 FloatArray = NDArray[np.float32]
@@ -71,7 +72,7 @@ class Recipes:
     names: tuple[bytes, ...]
     """Names of the parents, each of which occurs once."""
     parents: tuple[FloatArray, ...]
-    """Their parameters; empty on the way to a worker, which has them by their names."""
+    """Their parameters; empty where they are known by their names: in an ask, and on the way to a worker."""
     parent_N_2: NDArray[np.int64]
     """Indices of each policy's parents x and y among the names."""
     key_N_4: Keys
@@ -175,15 +176,15 @@ MOST_ORIGINS = 1 << 16
 """Most entries of these."""
 
 
-def remember(recipes: Recipes, policy_N_D: Sequence[FloatArray]) -> None:
+def remember(recipes: Recipes, names: Sequence[bytes]) -> None:
     """Remember how policies were made, so that they need not travel if they become parents.
 
     Args:
-        policy_N_D: what `recipes.made` has given.
+        names: those of the policies that `recipes` make.
     """
     new = {}
-    for (x, y), key_4, parameters_D in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, policy_N_D, strict=True):
-        origin, name = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy()), name_of(parameters_D)
+    for (x, y), key_4, name in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, names, strict=True):
+        origin = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())
         if name not in (origin.x, origin.y):  # a policy as it is says nothing of how it was made
             new[name] = origin
     with _CHANGING_ORIGINS:
@@ -197,8 +198,10 @@ def origin_of(name: bytes) -> Origin | None:
     return _ORIGINS.get(name)
 
 
-def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray[np.int64], key_N_4: Keys) -> Recipes:
-    """Recipes of parents that are given by their parameters, [D] each.
+def recipes_of(
+    rule: IsoLine, parents: Sequence[FloatArray] | NDArray[Any], parent_N_2: NDArray[np.int64], key_N_4: Keys
+) -> Recipes:
+    """Recipes of parents that are given by their parameters, [D] each, or by an array of their names.
 
     Args:
         parent_N_2: indices of each policy's parents x and y.
@@ -207,11 +210,13 @@ def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray
     Raises:
         TypeError: a parent is no array.
     """
+    if isinstance(parents, np.ndarray) and parents.dtype == NAME:
+        return Recipes(rule, tuple(as_bytes(parents)), (), parent_N_2, key_N_4)
     return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
 
 
-def unvaried(policies: Sequence[FloatArray]) -> Recipes:
-    """Recipes of policies as they are, [D] each, for those that workers may know already as parents of others."""
+def unvaried(policies: Sequence[FloatArray] | NDArray[Any]) -> Recipes:
+    """Recipes of policies as they are, given as to `recipes_of`; workers may know them already as parents of others."""
     itself_N_2 = np.repeat(np.arange(len(policies))[:, None], 2, axis=1)
     return recipes_of(IsoLine(0.0, 0.0), policies, itself_N_2, np.zeros((len(policies), KEY_WORDS), np.uint32))
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +16,23 @@ from numpy.typing import NDArray
 
 from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
+from es_service.loop.arrays import BEST, MAP, joined, value_of
 from es_service.loop.forms import problem
 from es_service.loop.history import evaluated_nouns
-from es_service.loop.parts import BEST, ELITE_PREFIX, map_from_parts
+from es_service.protocol.content import as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.report.series import X_AXES, Columns
 from es_service.runs.certified import Certified, certified_elsewhere, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.strangers import sizes_of, sound_meta
-from es_service.runs.view import Run, is_light
+from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
 from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
 
 TRACE = "trace_T_B"
-POINT = "centre_D"
-MOST_PARAMETERS = 1000
-"""Most parameters of a function that a report shows."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     """
 
     driver = lock_holder(folder)  # read before the history, so that the last row is not missed
-    sound = read_sound(folder, _kept if paths else _kept_without_paths)
+    sound = read_sound(folder, _kept, partial(_named, paths=paths))
     data = run_data(folder, sound, driver)
     if not digest or driver is not None or sound.newest is None:
         return data
@@ -143,7 +142,8 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
     certified, elsewhere = _certified(folder, problems)
-    spec, point_D = task.parameters, None if best is None else best.get(POINT)
+    spec, content = task.parameters, {} if best is None else found.contents.get(best["policy"].tobytes(), {})
+    point_D = content.get("parameters_D")
     return RunData(
         folder=folder,
         meta=found.meta,
@@ -166,21 +166,23 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
 def _kept(meta: RunMeta, part: str, arrays: Arrays) -> Arrays | None:
     if found := problem(part, arrays, sizes_of(meta)):
         raise ValueError(found)
-    if part.startswith(ELITE_PREFIX):
-        return {TRACE: arrays[TRACE]}
-    if part == BEST:
-        point = {POINT: arrays[POINT]} if arrays[POINT].size <= MOST_PARAMETERS else {}  # or it is a policy's
-        return {name: arrays[name] for name in ("generation", "fitness")} | point
-    return arrays if is_light(part) else None
+    return arrays if _is_shown(part) else None
 
 
-def _kept_without_paths(meta: RunMeta, part: str, arrays: Arrays) -> Arrays | None:
-    return None if part.startswith(ELITE_PREFIX) else _kept(meta, part, arrays)
+def _is_shown(part: str) -> bool:
+    return part == BEST or part.startswith(MAP)
+
+
+def _named(meta: RunMeta, parts: dict[str, Arrays], *, paths: bool) -> list[bytes]:
+    """Names of the point of a function, and with `paths` of those of the elites."""
+    best, has_point = parts.get(BEST), meta.task.get("parameters") is not None
+    traces = [name for block in parts.values() if "trace_N" in block for name in as_bytes(block["trace_N"])]
+    return [*([best["policy"].tobytes()] if best is not None and has_point else []), *(traces if paths else [])]
 
 
 def followed(folder: Path) -> Followed:
     """A run that is read again and again for `run_data`, without paths: no elite is read."""
-    return Followed(folder, _kept, lambda part: part == BEST or is_light(part))
+    return Followed(folder, _kept, _is_shown, partial(_named, paths=False))
 
 
 def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
@@ -190,18 +192,20 @@ def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
 
 
 def _map(sound: SoundRun, problems: list[str]) -> BehaviourMap | None:
-    map_ = map_from_parts(sound.parts)
+    map_ = value_of(BehaviourMap | None, joined(sound.parts), MAP)
     if map_ is None and sound.meta.constants.get("map.enabled") and sound.generation is not None:
         problems.append("the behaviour map cannot be shown, because its geometry is damaged")
     return map_
 
 
 def _paths(sound: SoundRun) -> dict[int, NDArray[np.float32]]:
-    return {
-        int(part.removeprefix(ELITE_PREFIX)): arrays[TRACE]
-        for part, arrays in sound.parts.items()
-        if part.startswith(ELITE_PREFIX)
+    traces = {
+        int(cell): sound.contents.get(name)
+        for block in sound.parts.values()
+        if "trace_N" in block
+        for cell, name in zip(block["cell_N"], as_bytes(block["trace_N"]), strict=True)
     }
+    return {cell: trace[TRACE] for cell, trace in traces.items() if trace is not None}
 
 
 def _certified(folder: Path, problems: list[str]) -> tuple[Certified | None, Mapping[str, Certified]]:

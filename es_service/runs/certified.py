@@ -92,9 +92,8 @@ class Certified:
     """Number of policies from which it was chosen."""
     selection_steps: int
     """Environment steps of all selection episodes of the certification, which belong to the cost of the result."""
-    decides: bool | None
-    """Whether the episodes decided if the run has reached `budget.target_certified`; None: of a version before 0.24,
-    whose certifications of a single candidate may have decided and were reported."""
+    decides: bool
+    """Whether the episodes decided if the run has reached `budget.target_certified`."""
     tries: int
     """Number of this decision, from 1, or of those until the run was over; 0 if no decision belongs to it."""
     platform: Mapping[str, Any]
@@ -196,7 +195,7 @@ def certified_elsewhere(folder: Path) -> dict[str, Certified]:
 
 def decisions(policies: Iterable[Certified]) -> list[Certified]:
     """Those of a run's certifications whose episodes decide if it has reached `budget.target_certified`."""
-    return [policy for policy in policies if policy.decides is not False and policy.episodes.count >= EPISODES]
+    return [policy for policy in policies if policy.decides and policy.episodes.count >= EPISODES]
 
 
 def passed(policies: Iterable[Certified], target: float, fitness: str) -> Certified | None:
@@ -207,10 +206,8 @@ def passed(policies: Iterable[Certified], target: float, fitness: str) -> Certif
 
 def report_of(policies: Iterable[Certified], decision: Certified) -> Certified | None:
     """The certified value of a policy that has passed a decision: of later episodes, which decide nothing. None if it
-    is still missing. Before 0.24, the episodes of the decision were quoted."""
-    if decision.decides is None:
-        return decision
-    later = (one for one in policies if one.number > decision.number and one.decides is False)
+    is still missing."""
+    later = (one for one in policies if one.number > decision.number and not one.decides)
     return next((one for one in later if one.episodes.count >= EPISODES and _same_policy(one, decision)), None)
 
 
@@ -238,8 +235,6 @@ def target_reached(folder: Path, target: float | None, fitness: str) -> str:
         f"the target {target:g} is reached: a policy of generation {decision.generation} has {mean:.6g} in the "
         f"{decision.episodes.count} episodes that decide"
     )
-    if report is decision:
-        return f"{what}, which a version before 0.24 also quoted; certify it again for a value that decides nothing"
     below = ", below the target" if value < target else ""
     tries = f"try {report.tries:,} so far, with any target"
     return f"{what} ({tries}), and {value:.6g} in {report.episodes.count} further certified ones{below}"
@@ -319,8 +314,7 @@ def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     there: dict[str, Any] = {
         name.removeprefix(prefix): array for name, array in row.arrays.items() if name.startswith(prefix)
     }
-    older = {"decides": None if row.facts.get("candidates") == 1 else False, "tries": 0}
-    facts = {**older, **row.facts}
+    facts = dict(row.facts)
     lengths = {"D": sizes.parameters, "O": sizes.observation, "B": sizes.dimensions}
     found = array_problem(arrays, _NEEDED, _MORE, lengths)
     if not found and facts.get(_ELSEWHERE) is not None:  # its descriptor has other dimensions

@@ -21,8 +21,8 @@ from es_service.config.workload import worker_spec
 from es_service.dispatch.dispatch_log import no_log
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
+from es_service.loop.arrays import BEST, CENTRES, OBSERVATIONS
 from es_service.loop.generation import evaluate_centres
-from es_service.loop.parts import BEST
 from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
@@ -30,7 +30,7 @@ from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.snapshot import Policy, Snapshot, make_policy
-from es_service.runs.view import Run, is_no_elite
+from es_service.runs.view import Run, named_best
 from es_service.runs.worker_count import on_this_machine, require_cores
 from es_service.search.observation_statistics import merge_moments, moments_of
 
@@ -132,10 +132,10 @@ def candidates(
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     chosen = []
     if best:
-        snapshot = run.at(generation, lambda part: part == BEST)
+        snapshot = run.at(generation, [BEST], named_best)
         chosen.append(Candidate("best", snapshot.policy("best"), snapshot.best.generation, snapshot.best.fitness))
     if centre:
-        snapshot = run.at(generation, is_no_elite)
+        snapshot = run.at(generation, [CENTRES, OBSERVATIONS])
         _, fitness = snapshot.require_newest_centre()
         chosen.append(Candidate("centre", snapshot.policy("centre"), snapshot.generation, fitness))
     if not cells and not every and not top:

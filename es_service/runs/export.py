@@ -18,7 +18,7 @@ from es_service.runs.certified import newest_certified
 from es_service.runs.onnx import about, model_card, onnx_model
 from es_service.runs.snapshot import Policy, Snapshot, map_places
 from es_service.runs.trackers import TensorBoard, check_trackers, fill
-from es_service.runs.view import Run, is_no_elite
+from es_service.runs.view import Run, named_best, named_by_all
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
 from es_service.store.folder import leads_out
@@ -72,7 +72,7 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
 
     The parameters are those of the best centre, of the newest one (if the generation evaluated one) and of the elites:
     `which` is best, centre or the place of a cell, such as 3,17; then each parameter in the units of the function."""
-    snapshot = run.at(wanted=is_no_elite) if run.parameter_spec is None else run.at()
+    snapshot = run.at(named=(lambda snapshot: ()) if run.parameter_spec is None else named_by_all)
     yield "history", run.history_until(snapshot.generation).reset_index()
     yield "evaluations", run.evaluations_until(snapshot.generation)
     yield "novelty", snapshot.novelty
@@ -98,7 +98,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`). If the task is
     a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
-    snapshot = run.at()
+    snapshot = run.at(named=named_by_all)
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
     exported: dict[str, Any] = {
         "widths": np.array(spec.widths),
@@ -272,7 +272,7 @@ def _npz(run: Run, folder: Path) -> list[Path]:
 
 
 def _onnx(run: Run, folder: Path) -> list[Path]:
-    certified, snapshot = newest_certified(run.folder), run.at(wanted=is_no_elite)
+    certified, snapshot = newest_certified(run.folder), run.at(named=named_best)
     policies: dict[str, Policy] = {} if certified is None else {"certified": run.policy("certified")}
     policies["best"] = snapshot.policy("best")
     if snapshot.newest_centre is not None:

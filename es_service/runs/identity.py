@@ -8,8 +8,9 @@ from typing import Any
 from es_service.config.model import RunConfig
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, WayOut
+from es_service.loop.arrays import Changes
 from es_service.loop.history import HistoryRow, Table
-from es_service.loop.parts import Changes
+from es_service.protocol.content import Contents
 from es_service.protocol.machine import CODE, computed_on, is_mixed, platform_info, without_code
 from es_service.protocol.sources import Sources, driver_sources, in_words, other_files, worker_sources
 from es_service.store.writer import RunStore
@@ -123,7 +124,13 @@ class Recorder:
         return frozenset() if self._engine is None else self._engine.platforms
 
     def commit(
-        self, workers: frozenset[str], generation: int, parts: Changes, history: HistoryRow, evaluations: Table
+        self,
+        workers: frozenset[str],
+        generation: int,
+        parts: Changes,
+        history: HistoryRow,
+        evaluations: Table,
+        contents: Contents,
     ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 
@@ -149,4 +156,4 @@ class Recorder:
                     f"from generation {generation} on, this run is computed on another platform, or on several: "
                     f"{in_words(changes)}. {MIXED}"
                 )
-        self._store.commit(generation, parts, history, evaluations)
+        self._store.commit(generation, parts, history, evaluations, contents)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,37 +20,32 @@ from es_service.config.tasks import task_of
 from es_service.config.text import show
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, Problem
-from es_service.loop.parts import (
+from es_service.loop.arrays import (
+    ARCHIVE,
     BEST,
-    CELL_PREFIX,
-    CENTRE_PREFIX,
-    ELITE_PREFIX,
+    CENTRES,
+    MAP,
     OBSERVATIONS,
-    WEIGHT,
-    Arrays,
-    Parts,
-    archive_from_parts,
-    moments_from_arrays,
-    moments_to_arrays,
-    weight_from_arrays,
-    weight_to_arrays,
-    with_step,
+    names_of,
+    state_of,
+    stored,
+    value_of,
 )
+from es_service.loop.state import RunState
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config, changes_from
 from es_service.runs.snapshot import Policy, Snapshot, make_policy
-from es_service.runs.view import Run, is_no_elite, open_run
+from es_service.runs.view import Run, named_best, named_by_all, open_run
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import NO_CELL, FitnessWeight
+from es_service.search.algorithms.base import NO_CELL, CentreState, FitnessWeight, SearchState
 from es_service.search.algorithms.starts import elite_novelty
-from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
+from es_service.search.novelty import sound_archive
 from es_service.search.observation_statistics import no_observations
-from es_service.search.state_parts import changes, from_parts
 from es_service.search.steps import fresh_state
 from es_service.store import reader
 from es_service.store.beginning import SEVERAL, Beginning
 from es_service.store.certifications import CERTIFICATIONS
-from es_service.store.codec import Part
 from es_service.store.digest import digest_at
 
 NORMALISED = "policy.observation_normalization"
@@ -115,32 +112,29 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     Raises:
         StoreError: the state of that generation is not kept.
     """
-    at, parts = origin.parts(generation)
+    snapshot = origin.at(generation, named=named_by_all)
+    at, state = snapshot.generation, state_of(snapshot.nodes, snapshot.generation, 0.0)
     changed = {name for name, _, _ in changes_from(origin.constants, config)}
     if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS)):
-        parts = _without_fitness(parts)
+        state = _without_fitness(state)
     elif changed.intersection(SCORE_KEYS):
-        parts = _without_scores(parts)
+        state = _without_scores(state)
+    search, algorithm = state.search, ALGORITHMS[config.search.algorithm](config)
     if "search.algorithm" in changed:
-        weight = FitnessWeight(ALGORITHMS[config.search.algorithm](config).fitness_weight)
-        parts = {**parts, WEIGHT: weight_to_arrays(weight)}
-    constants = config.constants()
+        search = replace(search, weight=FitnessWeight(algorithm.fitness_weight))
     if "search.step.kind" in changed:
-        parts = {
-            name: with_step(part, fresh_state(config.search, part["centre_D"].size))
-            if name.startswith(CENTRE_PREFIX)
-            else part
-            for name, part in parts.items()
-        }
-    if "search.parent_statistics" in changed and constants["search.parent_statistics"] == "global":
-        parts = _without_elite_statistics(parts)
-    known = from_parts(parts)
-    begun = ALGORITHMS[config.search.algorithm](config).extra
-    own = changes({**begun, **known}, known)  # what only the changed settings need begins as in a new run
-    parts = {**parts, **{name: arrays for name, arrays in own.items() if arrays is not None}}
+        search = _with_centres(
+            search, lambda centre: replace(centre, step=fresh_state(config.search, centre.centre_D.size))
+        )
+    if "search.parent_statistics" in changed and config.constants()["search.parent_statistics"] == "global":
+        # Also in the middle of a block that began with the statistics of an elite.
+        search = _with_centres(search, lambda centre: replace(centre, own_mean_O=None, own_std_O=None))
+    # What only the changed settings need begins as in a new run.
+    blocks = stored(replace(state, search=replace(search, extra={**algorithm.extra, **search.extra})))
+    contents = {name: snapshot.contents[name] for name in names_of(blocks)}
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     history, evaluations = (_in_pieces(read, origin, at) for read in (reader.read_history, reader.read_evaluations))
-    return _lineage(origin, at), Beginning(history, parts, platforms, newest=at, evaluations=evaluations)
+    return _lineage(origin, at), Beginning(history, blocks, contents, platforms, newest=at, evaluations=evaluations)
 
 
 def _in_pieces(read: Callable[[Path, int, int], Sequence[Any]], origin: Run, newest: int) -> Iterator[Any]:
@@ -150,29 +144,33 @@ def _in_pieces(read: Callable[[Path, int, int], Sequence[Any]], origin: Run, new
         yield from read(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
 
-def _without_fitness(parts: Parts) -> dict[str, Arrays]:
-    """The parts of a state without any past fitness: no best centre, an empty map, no record to beat."""
-    kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
-    for name, part in kept.items():
-        if name.startswith(CENTRE_PREFIX):
-            part["cell"] = np.asarray(NO_CELL, np.int64)
-    kept[BEST]["fitness"] = np.asarray(-np.inf)
-    kept[WEIGHT] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts[WEIGHT]).value))
-    return kept
+def _without_fitness(state: RunState) -> RunState:
+    """A state without any past fitness: no fitness of the best centre, an empty map, no record to beat."""
+    search = _with_centres(state.search, lambda centre: replace(centre, cell=NO_CELL))
+    map_ = search.map
+    if map_ is not None:
+        map_ = empty_map(map_.geometry, counts_samples=map_.samples_N is not None)
+    search = replace(search, map=map_, weight=FitnessWeight(search.weight.value))
+    return replace(state, search=search, best=replace(state.best, fitness=-math.inf))
 
 
-def _without_scores(parts: Parts) -> dict[str, Arrays]:
-    """The parts of a state without the elites' scores: the highest fitness of a population is not comparable with that
-    of a population of another size, or with another noise in its fitness."""
-    nothing = {"score": np.asarray(np.nan)}
-    return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
+def _without_scores(state: RunState) -> RunState:
+    """A state without the elites' scores: the highest fitness of a population is not comparable with that of a
+    population of another size, or with another noise in its fitness."""
+    map_ = state.search.map
+    if map_ is None:
+        return state
+    return replace(state, search=replace(state.search, map=replace(map_, score_N=np.full(map_.size, np.nan))))
 
 
-def _without_elite_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
-    """The parts of a state whose centres all use the observation statistics of the whole run, also in the middle of a
-    block that began with those of an elite."""
-    own = ("own_mean_O", "own_std_O")
-    return {name: {key: values for key, values in part.items() if key not in own} for name, part in parts.items()}
+def _with_centres(search: SearchState, change: Callable[[CentreState], CentreState]) -> SearchState:
+    """The state with a function of each centre in its place."""
+    return replace(search, centres=tuple(map(change, search.centres)))
+
+
+def _arrays_of(moments: Moments) -> dict[str, np.ndarray]:
+    """Observation statistics as arrays."""
+    return {name: np.asarray(value) for name, value in vars(moments).items()}
 
 
 def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> tuple[dict[str, Any], Beginning]:
@@ -202,16 +200,16 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         )
     if isinstance(config.search, CandidatesConfig):
         return _several(origin, config, config.search, which, tell)
-    snapshot = origin.at(wanted=is_no_elite)
-    moments, own = moments_from_arrays(snapshot.parts[OBSERVATIONS]), None
+    snapshot = origin.at(wanted=[CENTRES, OBSERVATIONS, BEST], named=named_best)
+    moments, own = value_of(Moments, snapshot.nodes, OBSERVATIONS), None
     if which == "centre":
         centre, _ = snapshot.require_newest_centre()
         centre_D = centre.centre_D
         if centre.own_mean_O is not None and centre.own_std_O is not None:
             own = centre.own_mean_O, centre.own_std_O
     else:
-        kept = snapshot.best if isinstance(which, str) else origin.elite(which)
-        centre_D, own = kept.centre_D, (kept.observation_mean_O, kept.observation_std_O)
+        policy = snapshot.policy("best") if isinstance(which, str) else origin.policy(which)
+        centre_D, own = policy.parameters_D, (policy.observation_mean_O, policy.observation_std_O)
     if not origin.constants[NORMALISED]:
         moments = no_observations(spec.widths[0])  # they were gathered, but its policy did not use them
     elif own is not None:
@@ -219,7 +217,7 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         mean_O, std_O = (values.astype(np.float64) for values in own)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
     _tell_otherwise(origin, config, tell)
-    start = {"centre_D": centre_D, **moments_to_arrays(moments)}
+    start = {"centre_D": centre_D, **_arrays_of(moments)}
     return _lineage(origin, snapshot.generation), Beginning(start=start)
 
 
@@ -236,7 +234,7 @@ def _several(
             suggestion=str(origin.folder),
             run=origin.folder,
         )
-    snapshot = origin.at()
+    snapshot = origin.at(wanted=[BEST, MAP, ARCHIVE], named=named_by_all)
     policies = [snapshot.policy("best")]
     if origin.constants["map.enabled"]:
         map_, elites = snapshot.elites()
@@ -252,7 +250,7 @@ def _several(
         SEVERAL: np.stack([policy.parameters_D for policy in chosen]),
         "mean_K_O": np.stack([policy.observation_mean_O for policy in chosen]),
         "std_K_O": np.stack([policy.observation_std_O for policy in chosen]),
-        **moments_to_arrays(no_observations(origin.policy_spec.widths[0])),
+        **_arrays_of(no_observations(origin.policy_spec.widths[0])),
     }
     return _lineage(origin, snapshot.generation), Beginning(start=start)
 
@@ -260,8 +258,7 @@ def _several(
 def _by_choice(snapshot: Snapshot, map_: BehaviourMap, config: RunConfig, search: CandidatesConfig) -> list[int]:
     """Rows of the map in the order of `search.candidate_choice`, the older one of equal ones first."""
     if search.candidate_choice == "novelty":
-        archive = archive_from_parts(snapshot.parts, map_.descriptor_N_B.shape[1])
-        key_N = -elite_novelty(map_, archive, config.novelty)
+        key_N = -elite_novelty(map_, sound_archive(snapshot.archive), config.novelty)
     elif search.candidate_choice == "place":
         middle = search.objective.descriptor if isinstance(search.objective, TargetObjective) else ()
         key_N = np.linalg.norm(map_.descriptor_N_B - np.asarray(middle), axis=1)

@@ -72,7 +72,7 @@ def certified_for(
     certified = [
         policy
         for policy in certified_policies(run.folder)
-        if policy.selected_by == by and policy.episodes.count >= EPISODES and policy.decides is False
+        if policy.selected_by == by and policy.episodes.count >= EPISODES
     ]
     if certified:
         newest = max(policy.number for policy in certified)

@@ -22,7 +22,6 @@ from es_service.errors import Action, EvaluationError, Interrupted, ServiceError
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.history import evaluated_word
-from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.evaluator import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
@@ -132,7 +131,7 @@ def work(
             "numbers, and `verify` cannot judge it. The run records this"
         )
     require_sound_state(store)
-    state = driver.stored_state(store, task)
+    state = driver.stored_state(store)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
         return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))  # without an engine
     search = driver.Search(
@@ -343,7 +342,7 @@ def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatAr
     if start is not None:
         several = start.get(SEVERAL)
         points = list(several) if several is not None else [start["centre_D"] for _ in centres]
-        return points, moments_from_arrays(start)
+        return points, Moments(float(start["count"]), start["mean_O"], start["m2_O"])
     return [initial_policy(config, centre) for centre in centres], no_observations(task.observation_size)
 
 

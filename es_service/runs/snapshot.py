@@ -12,25 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import NotInRunError
-from es_service.loop.parts import (
-    BEST,
-    OBSERVATIONS,
-    Parts,
-    archive_from_parts,
-    best_from_arrays,
-    centre_from_arrays,
-    centre_part,
-    elite_from_arrays,
-    elite_part,
-    map_from_parts,
-    moments_from_arrays,
-)
+from es_service.loop.arrays import ARCHIVE, BEST, MAP, OBSERVATIONS, Nodes, centre_path, value_of
+from es_service.loop.contents import elite_of
 from es_service.loop.state import Best, statistics_in_force
-from es_service.protocol.messages import FloatArray, PolicySpec
+from es_service.protocol.content import Contents, as_bytes
+from es_service.protocol.messages import FloatArray, Moments, PolicySpec
 from es_service.runs.strangers import policy_spec
 from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
+from es_service.search.novelty import NoveltyArchive
 from es_service.store import reader
 from es_service.store.schema import RunMeta
 from workers.policies.outputs import action
@@ -103,12 +94,15 @@ class Policy:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The state of a run after one generation, read at once and checked; `parts` may be only some of its parts."""
+    """The state of a run after one generation, read at once and checked."""
 
     folder: Path
     meta: RunMeta
     generation: int
-    parts: Parts
+    nodes: Nodes
+    """Arrays of the nodes of its state, or of those that were wanted."""
+    contents: Contents = field(default_factory=dict)
+    """The policies and traces that were wanted, by their names."""
 
     @property
     def novelty(self) -> pd.DataFrame:
@@ -116,14 +110,19 @@ class Snapshot:
         import pandas as pd
 
         names = descriptor_names(self.meta)
-        archive = archive_from_parts(self.parts, len(names))
+        archive = self.archive
         columns = {"generation": archive.generation_N, "centre": archive.centre_N}
         return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
 
     @property
+    def archive(self) -> NoveltyArchive:
+        """The novelty archive as arrays."""
+        return value_of(NoveltyArchive, self.nodes, ARCHIVE)
+
+    @property
     def behaviour_map(self) -> BehaviourMap:
         """The behaviour map as arrays; see `Run.behaviour_map`."""
-        map_ = map_from_parts(self.parts)
+        map_ = value_of(BehaviourMap | None, self.nodes, MAP)
         if map_ is None:
             raise NotInRunError(
                 f"{self.folder} has no behaviour map: it was started with map.enabled = false", run=self.folder
@@ -178,12 +177,13 @@ class Snapshot:
         """The map and its elites; see `Run.elites`."""
         map_ = self.behaviour_map
         chosen = map_.cell_N.tolist() if cells is None else cells
-        return map_, {cell: elite_from_arrays(self.parts[elite_part(cell)]) for cell in chosen}
+        names = {cell: map_names(map_, [cell]) for cell in chosen}
+        return map_, {cell: elite_of(*(self.contents[name] for name in of_cell)) for cell, of_cell in names.items()}
 
     @property
     def best(self) -> Best:
         """The best centre so far."""
-        return best_from_arrays(self.parts[BEST])
+        return value_of(Best, self.nodes, BEST)
 
     @property
     def newest_centre(self) -> tuple[CentreState, float] | None:
@@ -191,13 +191,13 @@ class Snapshot:
         evaluated only policies, as those of map_elites do."""
         [history] = reader.read_history(self.folder, self.generation, 1)
         row = {"centre": history["centre"], "fitness_mean": history["centre_fitness_mean"]}
-        if centre_part(int(row["centre"])) not in self.parts:  # the row of the history is about a policy
+        if centre_path(int(row["centre"])) not in self.nodes:  # the row of the history is about a policy
             [rows] = reader.read_evaluations(self.folder, self.generation, 1)
-            rows = [centre_row for centre_row in rows if centre_part(int(centre_row["centre"])) in self.parts]
+            rows = [centre_row for centre_row in rows if centre_path(int(centre_row["centre"])) in self.nodes]
             if not rows:
                 return None
             row = max(rows, key=lambda centre_row: np.nan_to_num(centre_row["fitness_mean"], nan=-np.inf))
-        return centre_from_arrays(self.parts[centre_part(int(row["centre"]))]), float(row["fitness_mean"])
+        return value_of(CentreState, self.nodes, centre_path(int(row["centre"]))), float(row["fitness_mean"])
 
     def require_newest_centre(self) -> tuple[CentreState, float]:
         """`newest_centre`. Raises NotInRunError if there is none."""
@@ -216,16 +216,27 @@ class Snapshot:
     def policy(self, which: Literal["best", "centre"]) -> Policy:
         """The best or the newest centre as a policy; see `Run.policy`."""
         if which == "best":
-            best = self.best
+            best = elite_of(self.contents[self.best.policy.tobytes()])
             return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
         (centre, _), enabled = self.require_newest_centre(), self.meta.constants["policy.observation_normalization"]
-        mean_O, std_O = statistics_in_force(moments_from_arrays(self.parts[OBSERVATIONS]), centre, enabled)
+        mean_O, std_O = statistics_in_force(value_of(Moments, self.nodes, OBSERVATIONS), centre, enabled)
         return make_policy(self.meta, centre.centre_D, mean_O, std_O)
 
 
 def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
     """A policy with the network and the observation clip of a run."""
     return Policy(policy_spec(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
+
+
+def map_names(map_: BehaviourMap, cells: Collection[int]) -> list[bytes]:
+    """Names of the policies of the elites of some cells, each followed by that of its trace. Raises KeyError for an
+    empty cell."""
+    rows = np.searchsorted(map_.cell_N, list(cells), sorter=(order := np.argsort(map_.cell_N)))
+    rows = np.append(order, 0)[rows]
+    if empty := [cell for cell, row in zip(cells, rows, strict=True) if not map_.size or map_.cell_N[row] != cell]:
+        raise KeyError(empty[0])
+    both = zip(as_bytes(map_.policy_N[rows]), as_bytes(map_.trace_N[rows]), strict=True)
+    return [name for names in both for name in names]
 
 
 def descriptor_names(meta: RunMeta) -> list[str]:

@@ -6,15 +6,14 @@ what the parts of a state are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
-
-import numpy as np
 
 from es_service.config.resolution import policy_of
 from es_service.errors import StoreError
-from es_service.loop.forms import INTEGER, REAL, Sizes, missing, problem
-from es_service.loop.parts import Parts
+from es_service.loop.arrays import Nodes, joined
+from es_service.loop.forms import INTEGER, REAL, Sizes, missing, policy_problem, problem
+from es_service.protocol.content import Arrays
 from es_service.protocol.messages import PolicySpec
 from es_service.search.steps import STEPS
 from es_service.store.schema import RunMeta
@@ -56,43 +55,40 @@ def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:
     return meta
 
 
-def sound_parts(
-    folder: Path, meta: RunMeta, parts: Parts, wanted: Callable[[str], bool] = lambda part: True
-) -> dict[str, dict[str, np.ndarray]]:
-    """Parts of a state.
+def sound_nodes(folder: Path, meta: RunMeta, blocks: Nodes, wanted: Collection[str] = ("",)) -> dict[str, Arrays]:
+    """The nodes of a state, of its blocks.
 
     Args:
-        wanted: whether a part of this name must be among them if every state has it.
+        wanted: the beginnings of the paths of the nodes that must be among them, if every state has them.
 
     Raises StoreError if one is missing, or has arrays that this run cannot have.
     """
-    require_whole(folder, meta, parts, wanted)
-    require_forms(folder, meta, parts)
-    return {name: dict(arrays) for name, arrays in parts.items()}
-
-
-def require_whole(
-    folder: Path, meta: RunMeta, names: Collection[str], wanted: Callable[[str], bool] = lambda part: True
-) -> None:
-    """Raise StoreError if a part that every state has is not among those of these names; `wanted` as for
-    `sound_parts`."""
-    if absent := missing(names, sizes_of(meta), wanted):
-        raise StoreError(f"{folder} is not what es-service writes: its state has no part {absent}", run=folder)
-
-
-def require_forms(folder: Path, meta: RunMeta, parts: Parts) -> None:
-    """Raise StoreError if a part has arrays that this run cannot have."""
     sizes = sizes_of(meta)
-    if found := next(filter(None, (problem(part, arrays, sizes) for part, arrays in parts.items())), ""):
+    try:
+        nodes = joined(blocks)
+    except (ValueError, KeyError) as error:  # blocks that do not fit each other
+        raise StoreError(f"{folder} is not what es-service writes: {error}", run=folder) from error
+    absent = missing(nodes, sizes, wanted)
+    found = f"its state has no part {absent}" if absent else ""
+    if found := found or next(filter(None, (problem(path, arrays, sizes) for path, arrays in nodes.items())), ""):
         raise StoreError(f"{folder} is not what es-service writes: {found}", run=folder)
+    return nodes
+
+
+def sound_contents(folder: Path, meta: RunMeta, contents: Mapping[bytes, Arrays]) -> Mapping[bytes, Arrays]:
+    """Policies and traces. Raises StoreError if one has arrays that this run cannot have."""
+    sizes = sizes_of(meta)
+    for name, arrays in contents.items():
+        if found := policy_problem(arrays, sizes):
+            text = f"{folder} is not what es-service writes: the content {name.hex()} {found}"
+            raise StoreError(text, run=folder)
+    return contents
 
 
 def require_sound_state(store: RunStore) -> None:
-    """Raise StoreError if the newest state in a store is none of its run; it is read part by part, since all elites
-    together may be large."""
+    """Raise StoreError if the newest state in a store, or a policy in it, is none of its run."""
     if store.generation is None:
         return
-    names = store.names()
-    require_whole(store.folder, store.meta, names)
-    for name in names:
-        require_forms(store.folder, store.meta, {name: store.part(name)})
+    sound_nodes(store.folder, store.meta, store.load())
+    for name in store.contents():  # one at a time, since all policies together may be large
+        sound_contents(store.folder, store.meta, {name: store.content(name)})

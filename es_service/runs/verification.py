@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
@@ -18,11 +17,11 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop import driver
 from es_service.loop.clock import Clock
-from es_service.loop.elites import Elites
-from es_service.loop.finished import reachable_in, rows
+from es_service.loop.contents import Contents
+from es_service.loop.finished import Finished, reachable_in, rows
 from es_service.loop.generation import initial_state
 from es_service.loop.history import HistoryRow, Table
-from es_service.loop.parts import Arrays, Changes
+from es_service.protocol.content import Arrays
 from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.certification import platform_of, workers_for
@@ -140,14 +139,13 @@ def _recompute(
 ) -> tuple[int, tuple[str, ...]]:
     """The generation that was reached, and what differs in it."""
     stored = _Comparison(run, begin)
-    state = driver.stored_state(stored, search.task) or initial_state(search)
-    elites, clock, reachable = Elites(stored.part), Clock(0.0), reachable_in(search, state)
+    state = driver.stored_state(stored) or initial_state(search)
+    policies, clock, reachable = Contents(stored.content), Clock(0.0), reachable_in(search, state)
     while True:
-        requests = driver.generation(search, elites, stored.part, clock, state)
+        requests = driver.generation(search, policies, clock, state)
         finished = completed(requests, evaluator.evaluate)
         state = finished.state
-        differences = stored.compared(state.generation, finished.parts, *rows(search, finished, reachable))
-        elites.stored()
+        differences = stored.compared(finished, *rows(search, finished, reachable))
         if differences or state.generation == last:
             return state.generation, tuple(differences)
 
@@ -161,32 +159,30 @@ class _Comparison:
         self._stored, self._whole = reader.read_kept(run.folder)
         self._in_force = {} if begin is None else rows_in_force(self._stored, begin)
         self._sum = state_sum(self._in_force)
-        self._changed: dict[str, Mapping[str, Any] | None] = {}
+        self._contents: dict[bytes, Arrays] = {}
 
-    def load(self, without: str | None = None) -> dict[str, Arrays]:
-        """The state at the beginning, without the parts whose names begin with a prefix."""
-        wanted = lambda part: without is None or not part.startswith(without)  # noqa: E731
-        return self._run.parts(self.generation, wanted)[1]
+    def load(self) -> Mapping[str, Arrays]:
+        """The state at the beginning."""
+        return self._run.at(self.generation).nodes
 
     def newest_history(self, count: int) -> list[HistoryRow]:
         """None, since time is not compared."""
         return []
 
-    def part(self, name: str) -> Arrays:
-        """A part of the newest state: as it was computed, or else as it was at the beginning."""
-        if name in self._changed:
-            if (changed := self._changed[name]) is None:
-                raise KeyError(name)
-            return dict(changed)
-        return self._run.parts(self.generation, lambda part: part == name)[1][name]
+    def content(self, name: bytes) -> Arrays:
+        """A policy or a trace: as it was computed, or else as it was at the beginning."""
+        if (computed := self._contents.get(name)) is not None:
+            return computed
+        return self._run.at(self.generation, [], lambda snapshot: [name]).contents[name]
 
-    def compared(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> list[str]:
+    def compared(self, finished: Finished, history: HistoryRow, evaluations: Table) -> list[str]:
         """What differs in a generation, in words, which is the next one from now on."""
-        new = rows_listed(encode_changes(generation, parts))
+        generation = finished.state.generation
+        new = rows_listed(encode_changes(generation, finished.parts))
         old = {part: self._in_force[part] for part in new if part in self._in_force}
         self._sum = changed_sum(self._sum, old, new)
         self._in_force |= new
-        self._changed |= parts
+        self._contents |= finished.contents
         stored = reader.read_row(self._run.folder, generation)
         differences = _history_differences(self._run, stored, history)
         if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:

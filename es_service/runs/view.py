@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,13 +14,13 @@ import numpy as np
 from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.config.text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
-from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, Parts, elite_part
+from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, Nodes, names_of
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.system import given_path
 from es_service.runs.certified import all_certifications, certified_policies, newest_certified
-from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy
-from es_service.runs.strangers import policy_spec, sound_meta, sound_parts
+from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, map_names
+from es_service.runs.strangers import policy_spec, sound_contents, sound_meta, sound_nodes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.digest import checked_parts, digest_of
@@ -112,31 +112,42 @@ class Run:
         count = None if generation is None else generation + 1
         return _frame(reader.read_evaluation_columns(self.folder, count))
 
-    def parts(
-        self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
-    ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
-        """A generation (None: the newest) and its verified state parts, those `wanted`.
+    def at(
+        self,
+        generation: int | None = None,
+        wanted: Collection[str] = ("",),
+        named: Callable[[Snapshot], Iterable[bytes]] = lambda snapshot: (),
+    ) -> Snapshot:
+        """The state after a generation (None: the newest), as named arrays, all as of one moment.
+
+        Args:
+            wanted: beginnings of the paths of the nodes that are wanted.
+            named: returns the names of the policies and traces that are wanted, too.
 
         Raises StoreError if the state is not kept: the last two are, and those of `store.keep_every`; or if it is none
         of this run.
         """
-        at, parts = reader.read_parts(self.folder, generation, wanted)
-        return at, sound_parts(self.folder, self.meta, parts, wanted)
+        snapshots: list[Snapshot] = []
 
-    def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Snapshot:
-        """The state after a generation, with the arguments of `parts`. All parts together take as much memory as all of
-        the map's policies."""
-        return Snapshot(self.folder, self.meta, *self.parts(generation, wanted))
+        def named_by(at: int, blocks: Nodes) -> Iterable[bytes]:
+            nodes = sound_nodes(self.folder, self.meta, blocks, wanted)
+            snapshots.append(Snapshot(self.folder, self.meta, at, nodes))
+            return named(snapshots[-1])
+
+        _, _, contents = reader.read_parts(
+            self.folder, generation, lambda block: block.startswith(tuple(wanted)), named_by
+        )
+        return replace(snapshots[-1], contents=sound_contents(self.folder, self.meta, contents))
 
     @property
     def novelty(self) -> pd.DataFrame:
         """The novelty archive, one row per evaluated valid centre in order: generation, centre, descriptor."""
-        return self.at(wanted=lambda part: part.startswith(BLOCK_PREFIX)).novelty
+        return self.at(wanted=[ARCHIVE]).novelty
 
     @property
     def behaviour_map(self) -> BehaviourMap:
         """The behaviour map as arrays, without the elites' parameters. Raises NotInRunError if the run has none."""
-        return self.at(wanted=is_light).behaviour_map
+        return self.at(wanted=[MAP]).behaviour_map
 
     @property
     def map(self) -> pd.DataFrame:
@@ -144,14 +155,14 @@ class Run:
         and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre,
         and the number of its samples where the search counts them.
         """
-        return self.at(wanted=is_light).map
+        return self.at(wanted=[MAP]).map
 
     def cell(self, place: int | Sequence[int]) -> int:
         """Number of the filled cell at a place: its indices, such as (3, 17), or its number in a cvt map, such as 1023.
 
         Raises NotInRunError if the cell does not exist or is empty; the message names the nearest filled cell.
         """
-        return self.at(wanted=is_light).cell(place)
+        return self.at(wanted=[MAP]).cell(place)
 
     def elite(self, place: int | Sequence[int]) -> Elite:
         """The elite of a cell: parameters, observation statistics and trace. Raises as `cell`."""
@@ -172,15 +183,13 @@ class Run:
         """
         cells: Collection[int] = ()
 
-        def chosen(at: int, parts: Parts) -> list[str]:
+        def chosen(snapshot: Snapshot) -> list[bytes]:
             nonlocal cells
-            snapshot = Snapshot(self.folder, self.meta, at, sound_parts(self.folder, self.meta, parts, is_light))
-            cells = snapshot.behaviour_map.cell_N.tolist() if choose is None else choose(snapshot)
-            return [elite_part(cell) for cell in cells]
+            map_ = snapshot.behaviour_map
+            cells = map_.cell_N.tolist() if choose is None else choose(snapshot)
+            return map_names(map_, cells)
 
-        at, parts = reader.read_parts(self.folder, generation, is_light, chosen)
-        parts = sound_parts(self.folder, self.meta, parts, is_light)
-        return Snapshot(self.folder, self.meta, at, parts).elites(cells)
+        return self.at(generation, [MAP], chosen).elites(cells)
 
     @property
     def certified(self) -> pd.DataFrame:
@@ -245,9 +254,9 @@ class Run:
         """
         name = which if isinstance(which, str) else None  # a place may be an array
         if name == "best":
-            return self.at(wanted=lambda part: part == BEST).policy("best")
+            return self.at(wanted=[BEST], named=named_best).policy("best")
         if name == "centre":
-            return self.at(wanted=is_no_elite).policy("centre")
+            return self.at(wanted=[CENTRES, OBSERVATIONS]).policy("centre")
         if name == "certified":
             policy = newest_certified(self.folder)
             if policy is None:
@@ -303,14 +312,14 @@ def _frame(columns: Columns) -> pd.DataFrame:
     return pd.DataFrame(arrays, copy=False)
 
 
-def is_light(part: str) -> bool:
-    """Whether a part of the state belongs to the map without its elites' policies."""
-    return part == GEOMETRY_PART or part.startswith(CELL_PREFIX)
+def named_best(snapshot: Snapshot) -> list[bytes]:
+    """Name of the policy of the best centre."""
+    return [snapshot.best.policy.tobytes()]
 
 
-def is_no_elite(part: str) -> bool:
-    """Whether a part of the state is not the policy of an elite; there may be many of those."""
-    return not part.startswith(ELITE_PREFIX)
+def named_by_all(snapshot: Snapshot) -> frozenset[bytes]:
+    """Names of all policies and traces of a state."""
+    return names_of(snapshot.nodes)
 
 
 def open_run(folder: str | os.PathLike[str]) -> Run:

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
+from es_service.loop.arrays import Changes
 from es_service.loop.history import HistoryRow, Table
-from es_service.loop.parts import Changes
+from es_service.protocol.content import Arrays, Contents
 from es_service.runs.identity import Recorder
 from es_service.store.folder import DATABASE
 from es_service.store.writer import RunStore
@@ -71,36 +70,35 @@ class PatientStore:
         """Hold nothing yet. `on_commit` is called with each generation that has been committed; `tell` with notices."""
         self._store, self._recorder = store, recorder
         self._should_stop, self._tell, self._on_commit = should_stop, tell, on_commit
-        self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table]]] = deque()
-        self._parts: dict[str, Mapping[str, np.ndarray] | None] = {}
-        """What they have changed of the state, the newest of each part."""
+        self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table, Contents]]] = deque()
         self._bytes, self._again_s, self._is_held = 0, 0.0, False
         self._told: set[str] = set()
 
-    def part(self, name: str) -> Mapping[str, np.ndarray]:
-        """One part of the state after the newest generation that was given.
+    def content(self, name: bytes) -> Arrays:
+        """A content that a generation names that was given.
 
         Raises:
-            Interrupted: a stop was requested while it could not be read. Otherwise as `RunStore.part`.
+            Interrupted: a stop was requested while it could not be read. Otherwise as `RunStore.content`.
         """
-        if name not in self._parts:
-            return when_free(partial(self._store.part, name), self._pause)
-        if (arrays := self._parts[name]) is None:
-            raise KeyError(name)
-        return arrays
+        for _, _, (*_, contents) in self._waiting:
+            if name in contents:
+                return contents[name]
+        return when_free(partial(self._store.content, name), self._pause)
 
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
+    def commit(
+        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table, contents: Contents
+    ) -> None:
         """Store a generation, or let it wait in memory while another program holds the database.
 
         Raises:
             Interrupted: so many generations wait that the run has paused, and a stop was requested. Otherwise as
                 `Recorder.commit`.
         """
-        arrays = [array for part in (*parts.values(), evaluations) if part is not None for array in part.values()]
+        given = (*parts.values(), *contents.values(), evaluations)
+        arrays = [array for part in given if part is not None for array in part.values()]
         size = sum(array.nbytes for array in arrays)
         is_first = not self._waiting
-        self._waiting.append((size, self._recorder.workers(), (generation, parts, history, evaluations)))
-        self._parts.update(parts)
+        self._waiting.append((size, self._recorder.workers(), (generation, parts, history, evaluations, contents)))
         self._bytes += size
         if is_first or time.monotonic() >= self._again_s:
             self.store_waiting(PATIENCE_S if is_first else 0.0)
@@ -120,7 +118,6 @@ class PatientStore:
         except DatabaseHeldError:
             self._hold()
             return False
-        self._parts.clear()
         if self._is_held:
             self._is_held = False
             self._store.lock.say()

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from es_service.protocol.system import usable_cpus
 from es_service.search.novelty_tree import COPIES, Tree, make_tree
-from es_service.search.state_parts import same_rows
 
 Distance = Literal["euclidean", "squared_euclidean"]
 
@@ -64,11 +63,13 @@ class NoveltyArchive:
     """Generation in which each was evaluated; 0 for initial centres."""
     centre_N: NDArray[np.int64]
     """Index of the centre that made each entry."""
-    tree: Tree | None = None
+    tree: Tree | None = field(default=None, metadata={"derived": True})
     """A tree over the first entries, derived from `descriptor_N_B`; None for a small archive."""
-    room: _Room | None = None
+    room: _Room | None = field(default=None, metadata={"derived": True})
     """Storage of which the arrays are the first part; None if they are their own storage."""
-    newest: dict[int, NoveltyArchive] = field(default_factory=dict, repr=False, compare=False)
+    newest: dict[int, NoveltyArchive] = field(
+        default_factory=dict, repr=False, compare=False, metadata={"derived": True}
+    )
     """Archives of only its newest entries, by their number; derived, and made when one is first needed."""
 
     @property
@@ -104,18 +105,6 @@ def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, 
     room.descriptor_B[size], room.generation[size], room.centre[size] = descriptor_B, generation, centre
     room.used = size + 1
     return _with_tree(room, archive.tree)
-
-
-def same_entries(archive: NoveltyArchive, earlier: NoveltyArchive) -> int:
-    """Number of first entries in which two archives that `sound_archive` has returned are the same, bit for bit."""
-    count = min(archive.size, earlier.size)
-    if archive.room is earlier.room:
-        return count  # an entry of a room is written once
-    if archive.descriptor_N_B.shape[1:] != earlier.descriptor_N_B.shape[1:]:
-        return 0
-    for now, then in zip(_columns(archive), _columns(earlier), strict=True):
-        count = same_rows(now[:count], then[:count])
-    return count
 
 
 def sound_archive(archive: NoveltyArchive) -> NoveltyArchive:

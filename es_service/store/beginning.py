@@ -30,7 +30,7 @@ from es_service.store.facts import Damaged
 from es_service.store.platforms import record
 from es_service.store.rows import insert_history
 from es_service.store.schema import RunMeta, get_meta, put_meta
-from es_service.store.states import insert_state
+from es_service.store.states import insert_contents, insert_state
 
 SEVERAL = "centre_K_D"
 """Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""
@@ -47,6 +47,8 @@ class Beginning:
     memory. Columns that this run does not have are left out; columns that the parent does not have get no value."""
     parts: Mapping[str, Part] = field(default_factory=dict)
     """State of the parent at generation `newest`."""
+    contents: Mapping[bytes, Part] = field(default_factory=dict)
+    """Policies and traces that this state names."""
     platforms: Sequence[tuple[int, dict[str, Any]]] = ()
     """(first generation, platform) of the parent, up to generation `newest`."""
     start: Part | None = None
@@ -62,10 +64,11 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
     with connection:
         connection.execute("BEGIN IMMEDIATE")
         in_force: dict[str, tuple[int, str]] = {}
-        for part, arrays in beginning.parts.items():  # one at a time, because all elites together may be large
+        for part, arrays in beginning.parts.items():
             rows = encode_changes(beginning.newest, {part: arrays})
             insert_state(connection, rows)
             in_force |= rows_listed(rows)
+        insert_contents(connection, beginning.contents.items())
         evaluations = iter(beginning.evaluations)
         for generation, given in enumerate(beginning.history):
             values = {column.name: given.get(column.name) for column in meta.columns}

@@ -20,6 +20,7 @@ from pydantic import Field, StringConstraints
 
 from es_service.errors import StoreError
 from es_service.loop.history import NO_INTEGER, Column
+from es_service.protocol.content import NAME
 from es_service.store.facts import Damaged, facts
 
 Part = Mapping[str, NDArray[Any]]
@@ -42,7 +43,7 @@ _HEADER_LENGTH = struct.Struct("<I")
 INTEGER = struct.Struct("<cq")
 REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
-_TYPE = Annotated[str, StringConstraints(pattern=f"^[<|][{_NUMERIC_KINDS}][0-9]{{1,2}}$")]
+_TYPE = Annotated[str, StringConstraints(pattern=f"^([<|][{_NUMERIC_KINDS}][0-9]{{1,2}}|[|]{NAME.str[1:]})$")]
 _SHAPE = Annotated[list[Annotated[int, Field(ge=0, lt=2**48)]], Field(max_length=32)]
 _HEADER = list[tuple[str, _TYPE, _SHAPE]]
 """Name, type and shape of each array, as JSON."""
@@ -52,14 +53,16 @@ def encode_part(part: Part) -> bytes:
     """A state part as bytes: a magic number, the length of the header, the JSON header [[name, dtype, shape], ...]
     sorted by name, and the values of the arrays in little-endian byte order.
 
-    Raises StoreError if an array has neither bools nor numbers.
+    Raises StoreError if an array has neither bools nor numbers nor names.
     """
     header: list[tuple[str, str, tuple[int, ...]]] = []
     raw: list[bytes] = []
     for name in sorted(part):
         array = np.asarray(part[name])
-        if array.dtype.kind not in _NUMERIC_KINDS:
-            raise StoreError(f"state array {name!r} has dtype {array.dtype}; only bools and numbers can be stored")
+        if array.dtype.kind not in _NUMERIC_KINDS and array.dtype != NAME:
+            raise StoreError(
+                f"state array {name!r} has dtype {array.dtype}; only bools, numbers and names can be stored"
+            )
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
         header.append((name, little.dtype.str, array.shape))
         raw.append(little.tobytes(order="C"))

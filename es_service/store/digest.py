@@ -14,14 +14,11 @@ import sqlite3
 from collections.abc import Mapping
 from itertools import groupby
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
-from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
+from es_service.loop.arrays import BLOCK, MAP
+from es_service.protocol.content import name_of
 from es_service.protocol.machine import is_mixed
-from es_service.search.state_parts import PIECE
 from es_service.store.codec import column_bytes, decode_part, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
@@ -42,9 +39,9 @@ def digest_of(parts: Mapping[str, str]) -> str:
 def digest_parts(folder: Path) -> dict[str, str]:
     """The SHA-256s of which the digest is made, by name. Raises StoreError if the run cannot be read.
 
-    `state/<part>` is that of the newest value of a state part, or of all of its pieces (`part/number`), `map` that of
-    all parts of the behaviour map, and `history` that of the deterministic columns of the history, `evaluations` that
-    of the evaluated centres.
+    `state/<path>` is that of the arrays of a node of the state, `map` that of the behaviour map; policies are in them
+    by their names, which are SHA-256s, too. `history` is that of the deterministic columns of the history,
+    `evaluations` that of the evaluated centres.
     """
     with reading(folder) as (connection, meta):
         return _parts(folder, connection, meta)
@@ -88,29 +85,18 @@ def _parts(folder: Path, connection: sqlite3.Connection, meta: RunMeta, until: i
 def _state(connection: sqlite3.Connection, until: int | None) -> dict[str, str]:
     newest = rows_in_force(kept_rows(connection), 2**63 if until is None else until)
     payloads = ((part, state_payload(connection, part, at)) for part, (at, _) in newest.items())
-    parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads}
-    of_map = {part: parts.pop(part) for part in [*parts] if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))}
-    pieces = {part: parts.pop(part) for part in [*parts] if PIECE in part}
-    digests = {f"state/{part}": sha256 for part, sha256 in parts.items()}
-    for whole, its_pieces in groupby(pieces, lambda piece: piece.partition(PIECE)[0]):
-        heads = {whole: parts[whole]} if whole in parts else {}
-        digests[f"state/{whole}"] = _together(heads | {piece: pieces[piece] for piece in its_pieces})
+    parts = {part: name_of(decode_part(payload)).hex() for part, payload in payloads}
+    of_map = {part: parts.pop(part) for part in [*parts] if part.startswith(MAP)}
+    digests = {
+        f"state/{path}": _together({block: parts[block] for block in blocks})
+        for path, blocks in groupby(parts, lambda block: block.partition(BLOCK)[0])
+    }
     return digests | ({"map": _together(of_map)} if of_map else {})
 
 
 def _together(parts: Mapping[str, str]) -> str:
     """SHA-256 of several parts, from theirs."""
     return hashlib.sha256("".join(f"{part}\0{sha256}\n" for part, sha256 in parts.items()).encode()).hexdigest()
-
-
-def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
-    """SHA-256 of arrays by name: of the name, type, shape and little-endian values of each, sorted by name."""
-    total = hashlib.sha256()
-    for name in sorted(arrays):
-        little = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
-        total.update(json.dumps([name, little.dtype.str, list(little.shape)]).encode() + b"\n")
-        total.update(little.tobytes(order="C"))
-    return total.hexdigest()
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, until: int | None) -> tuple[str, str]:

@@ -7,7 +7,7 @@ functions that take a folder raise StoreError as `reading` does, and if what the
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,15 @@ from es_service.store.facts import GENERATION, Damaged
 from es_service.store.platforms import sound_platforms
 from es_service.store.rows import HistoryRow, history_rows, newest_generation
 from es_service.store.schema import RunMeta
-from es_service.store.states import KeptRows, kept_rows, newest_state, rows_in_force, sound_part, whole_states
+from es_service.store.states import (
+    KeptRows,
+    kept_rows,
+    newest_state,
+    rows_in_force,
+    sound_content,
+    sound_part,
+    whole_states,
+)
 from es_service.store.tables import Columns, GrowingTable, table_rows
 
 EvaluatedCentres = list[dict[str, int | float]]
@@ -133,12 +141,12 @@ def read_parts(
     folder: Path,
     generation: int | None = None,
     wanted: Callable[[str], bool] = lambda part: True,
-    further: Callable[[int, dict[str, dict[str, NDArray[Any]]]], Collection[str]] = lambda generation, parts: (),
-) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation (None: the newest) and its state: part -> name -> array, of the parts whose names are `wanted`, and
-    of those that `further` names when it sees these, all as of one moment.
+    named: Callable[[int, dict[str, dict[str, NDArray[Any]]]], Iterable[bytes]] = lambda generation, parts: (),
+) -> tuple[int, dict[str, dict[str, NDArray[Any]]], dict[bytes, dict[str, NDArray[Any]]]]:
+    """A generation (None: the newest), its state: part -> name -> array, of the parts whose names are `wanted`, and the
+    contents that `named` names when it sees these, all as of one moment.
 
-    Raises StoreError also if the state of this generation is not kept, or has no such further part.
+    Raises StoreError also if the state of this generation is not kept, or there is no such content.
     """
     with reading(folder) as (connection, _):
         newest = newest_generation(connection)
@@ -163,10 +171,10 @@ def read_parts(
             )
         rows = rows_in_force(kept, asked)
         parts = {part: sound_part(connection, part, *row) for part, row in rows.items() if wanted(part)}
-        names = further(asked, parts)
-        if lacking := [part for part in names if part not in rows]:
-            raise Damaged(f"its state has no part {lacking[0]}")
-        return asked, parts | {part: sound_part(connection, part, *rows[part]) for part in names if part not in parts}
+        try:
+            return asked, parts, {name: sound_content(connection, name) for name in named(asked, parts)}
+        except KeyError as lacking:
+            raise Damaged(f"it has no content {lacking.args[0].hex()}, which its state names") from lacking
 
 
 def read_kept(folder: Path) -> tuple[KeptRows, list[int]]:

@@ -18,6 +18,7 @@ from es_service.store.connection import connected_to
 from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file
 from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, load_meta, quoted
+from es_service.store.states import collect_contents
 from es_service.store.verify import Verdict, verify
 
 PATIENCE_S = 10.0
@@ -108,6 +109,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
         for table in GENERATION_TABLES:
             connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
         connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
+        collect_contents(connection)
         certifications.remove(connection, verdict.bad_certifications)
     if verdict.good == verdict.newest:
         notices.append(

@@ -19,10 +19,7 @@ from es_service.store.facts import Damaged, RunFacts, column_problem, facts, req
 SCHEMA = "schema_version"
 """Record of the table `meta` with the schema version."""
 SCHEMA_VERSION = 8
-OLDEST_VERSION = 6
-"""Oldest schema version that is read and continued. In 6, a certification does not say whether it decided something;
-before 8, none has episodes in another task."""
-READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
+READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0", 6: "0.25.0", 7: "0.25.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
 """Number in the header of the file, by which tools recognise the kind of a database."""
@@ -32,13 +29,14 @@ GENERATION_TABLES = ("state", "history", "platform")
 """Tables whose rows belong to a generation; falling back to a generation deletes the newer rows of each table.
 
 A new table of this kind must be added here. Its rows must be hashed into the history row of their generation, as those
-of the state are; otherwise the loss of a row is not noticed."""
+of the state are; otherwise the loss of a row is not noticed. The table content has what rows of the state name."""
 
 _META = "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, sha256 TEXT NOT NULL) WITHOUT ROWID"
 _STATE = (
     "CREATE TABLE state (part TEXT NOT NULL, generation INTEGER NOT NULL, sha256 TEXT NOT NULL, "
     "payload BLOB NOT NULL, PRIMARY KEY (part, generation)) WITHOUT ROWID"
 )
+_CONTENT = "CREATE TABLE content (name BLOB PRIMARY KEY NOT NULL, payload BLOB NOT NULL)"
 _PLATFORM = "CREATE TABLE platform (generation INTEGER PRIMARY KEY, platform TEXT NOT NULL, sha256 TEXT NOT NULL)"
 _CERTIFICATION = (
     "CREATE TABLE certification (number INTEGER NOT NULL, rank INTEGER NOT NULL, facts TEXT NOT NULL, "
@@ -89,6 +87,7 @@ def table_statements(columns: Sequence[Column]) -> dict[str, str]:
     return {
         "meta": _META,
         "state": _STATE,
+        "content": _CONTENT,
         "history": f"CREATE TABLE history ({history}, {own})",
         "platform": _PLATFORM,
         "certification": _CERTIFICATION,
@@ -130,7 +129,7 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         Damaged: the description is damaged or missing.
         StoreError: `file` has another schema version.
     """
-    tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
+    tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql NOT NULL"))
     if tables.get("meta", _META) != _META:
         raise Damaged("its table meta is not that of a run")
     rows = connection.execute("SELECT key, value, sha256 FROM meta").fetchall()
@@ -146,11 +145,10 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         )
     if version < 1 or "run" not in records:
         raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")
-    if version < OLDEST_VERSION:
+    if version < SCHEMA_VERSION:
         raise StoreError(
             f"{file} was written by an older version of es-service; use version {READ_BY[version]} to read or continue "
-            f"it (its schema version is {version}, and this version of es-service supports {OLDEST_VERSION} to "
-            f"{SCHEMA_VERSION})"
+            f"it (its schema version is {version}, and this version of es-service supports {SCHEMA_VERSION})"
         )
     fields = facts(records["run"], RunFacts, "its description of the run", has_paths=True)
     require_form(fields["task"], TaskSpec, "its description of the task")

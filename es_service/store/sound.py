@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,16 @@ from es_service.store.folder import COPY
 from es_service.store.platforms import sound_platforms
 from es_service.store.rows import HistoryRow, history_rows, newest_generation
 from es_service.store.schema import RunMeta
-from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_part, whole_states
+from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_content, sound_part, whole_states
 from es_service.store.tables import Columns, GrowingTable, table_rows
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[RunMeta, str, Arrays], Arrays | None]
 """Function (the run, name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part. It raises
 ValueError for arrays that the run cannot have."""
+
+NamedBy = Callable[[RunMeta, dict[str, Arrays]], Iterable[bytes]]
+"""Function (the run, the parts that were kept) -> names of the contents that are wanted."""
 
 
 @dataclass(frozen=True)
@@ -48,25 +51,41 @@ class SoundRun:
     generation: int | None
     """Generation of `parts`; None if no state is stored."""
     parts: dict[str, Arrays]
+    contents: dict[bytes, Arrays]
+    """Contents that they name, as far as they were wanted."""
     problems: tuple[str, ...]
     """What is missing and why, one sentence each; empty if the run is sound as far as it was read."""
 
 
-def read_sound(folder: Path, kept: Kept = lambda meta, part, arrays: arrays) -> SoundRun:
+def read_sound(
+    folder: Path,
+    kept: Kept = lambda meta, part, arrays: arrays,
+    named: NamedBy = lambda meta, parts: (),
+) -> SoundRun:
     """Read a run as far as it is sound; see `SoundRun`. Parts are decoded one at a time, then passed to `kept`.
+
+    Args:
+        named: names of the contents that are wanted, of all parts that were kept.
 
     Raises:
         StoreError: neither the database nor its copy has a sound description of the run.
     """
-    return Followed(folder, kept).read()[0]
+    return Followed(folder, kept, named=named).read()[0]
 
 
 class Followed:
     """A run that is read again and again; each time, what was read before is not read anew."""
 
-    def __init__(self, folder: Path, kept: Kept, wanted: Callable[[str], bool] = lambda part: True) -> None:
-        """`kept`: as in `read_sound`; `wanted`: whether to read a part of this name at all."""
-        self.folder, self._kept, self._wanted = folder, kept, wanted
+    def __init__(
+        self,
+        folder: Path,
+        kept: Kept,
+        wanted: Callable[[str], bool] = lambda part: True,
+        named: NamedBy = lambda meta, parts: (),
+    ) -> None:
+        """`kept`, `named`: as in `read_sound`; `wanted`: whether to read a part of this name at all."""
+        self.folder, self._kept, self._wanted, self._named = folder, kept, wanted, named
+        self._contents: dict[bytes, Arrays] = {}
         self._rows: _Rows | None = None
         self._known: dict[str, tuple[tuple[int, str], Arrays | None]] = {}
 
@@ -79,7 +98,7 @@ class Followed:
         problems: list[str] = []
         with _any_sound(self.folder, problems) as (connection, meta):
             if self._rows is None or not self._rows.are_of(connection, meta):
-                self._rows, self._known = _Rows(meta), {}
+                self._rows, self._known, self._contents = _Rows(meta), {}, {}
             rows = self._rows
             platforms: list[tuple[int, dict[str, Any]]] = []
             whole = rows.read(connection, problems, most)
@@ -88,10 +107,13 @@ class Followed:
             generation, parts = None, {}
             with _noted(problems, "the state cannot be read"):
                 generation, parts = self._state(connection, meta, problems)
+                self._contents = self._named_by(connection, meta, parts, problems)
             # Nothing can be added to a table whose columns are in use.
             history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
             newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
-            return SoundRun(meta, history, newest, evaluations, platforms, generation, parts, tuple(problems)), whole
+            return SoundRun(
+                meta, history, newest, evaluations, platforms, generation, parts, self._contents, tuple(problems)
+            ), whole
 
     def _state(
         self, connection: sqlite3.Connection, meta: RunMeta, problems: list[str]
@@ -122,6 +144,21 @@ class Followed:
             more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
             problems.append(f"the state of {', '.join(damaged[:3])}{more} is damaged")
         return generation, {part: arrays for part, (_, arrays) in self._known.items() if arrays is not None}
+
+    def _named_by(
+        self, connection: sqlite3.Connection, meta: RunMeta, parts: dict[str, Arrays], problems: list[str]
+    ) -> dict[bytes, Arrays]:
+        """The contents that are wanted."""
+        contents, damaged = {}, 0
+        for name in self._named(meta, parts):
+            try:
+                known = self._contents.get(name)
+                contents[name] = sound_content(connection, name) if known is None else known
+            except (sqlite3.Error, Damaged, KeyError):
+                damaged += 1
+        if damaged:
+            problems.append(f"{damaged} of the policies and paths that its state names are damaged or missing")
+        return contents
 
 
 @contextlib.contextmanager

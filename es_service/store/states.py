@@ -5,24 +5,29 @@ until the next row of the part; a row without payload removes the part.
 
 Kept are the states of the last two generations, and those of generations that were asked for. A row is deleted when no
 state to which it belongs is to be kept. A row that removes its part is deleted together with the last of the older
-rows, from which it protects the states after it.
+rows, from which it protects the states after it. The contents that rows name, such as policies, are stored once, and
+are deleted together with the last row that names them.
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service.protocol.content import name_of, names_in
 from es_service.store.codec import (
     GONE,
     NO_PAYLOAD,
     ListedRows,
+    Part,
     StateRow,
     changed_sum,
     decode_part,
+    encode_part,
     part_sha256,
     state_sha256,
     state_sum,
@@ -30,6 +35,8 @@ from es_service.store.codec import (
 from es_service.store.facts import Damaged
 from es_service.store.rows import newest_generation
 
+Named = Mapping[tuple[str, int], frozenset[bytes]]
+"""(part, generation) of a state row -> names of contents in it."""
 KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
 
@@ -88,6 +95,39 @@ def whole_states(connection: sqlite3.Connection, kept: KeptRows) -> list[int]:
     return whole
 
 
+def sound_content(connection: sqlite3.Connection, name: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of a content. Raises KeyError if there is none of this name, Damaged if it is none of this name."""
+    row = connection.execute("SELECT payload FROM content WHERE name = ?", (name,)).fetchone()
+    if row is None:
+        raise KeyError(name)
+    if (arrays := content_of(name, row[0])) is None:
+        raise Damaged(f"the content {name.hex()} does not match its name")
+    return arrays
+
+
+def content_of(name: object, payload: object) -> dict[str, NDArray[Any]] | None:
+    """The arrays of a row of the table content; None if they do not match their name."""
+    try:
+        arrays = decode_part(payload) if isinstance(payload, bytes) else {}
+    except ValueError:
+        return None
+    return arrays if name_of(arrays) == name else None
+
+
+def insert_contents(connection: sqlite3.Connection, contents: Iterable[tuple[bytes, Part]]) -> None:
+    """Store contents that are not stored."""
+    rows = ((name, encode_part(arrays)) for name, arrays in contents)
+    connection.executemany("INSERT INTO content VALUES (?, ?)", rows)
+
+
+def collect_contents(connection: sqlite3.Connection) -> None:
+    """Delete the contents that no row of the state names."""
+    payloads = connection.execute("SELECT payload FROM state WHERE length(payload) > 0")
+    named = frozenset[bytes]().union(*(names_in(decode_part(payload)) for (payload,) in payloads))
+    stored = [name for (name,) in connection.execute("SELECT name FROM content")]
+    connection.executemany("DELETE FROM content WHERE name IS ?", [(name,) for name in stored if name not in named])
+
+
 def sound_part(connection: sqlite3.Connection, part: str, generation: int, sha256: str) -> dict[str, NDArray[Any]]:
     """The arrays of a state row that was found. Raises Damaged if it does not match its SHA-256, or has no arrays."""
     payload = state_payload(connection, part, generation)
@@ -111,9 +151,12 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
 class KeptStates:
     """The stored state rows, as the writer of a run follows them from commit to commit."""
 
-    def __init__(self, connection: sqlite3.Connection, rows: KeptRows, newest: int | None) -> None:
-        """`rows`: all intact rows that are stored; `newest`: newest generation, None if there is none."""
-        self._rows = rows
+    def __init__(self, connection: sqlite3.Connection, rows: KeptRows, named: Named, newest: int | None) -> None:
+        """`rows`: all intact rows that are stored; `named`: what they name; `newest`: newest generation, None if there
+        is none."""
+        self._rows, self._named = rows, dict(named)
+        self._count = Counter(name for names in named.values() for name in names)
+        """Number of rows that name each content."""
         self.total = 0 if newest is None else state_sum(rows_in_force(rows, newest))
         """`codec.state_sum` of the newest state."""
         # Parts of which an older row is stored as well, which the generation before the newest needs.
@@ -149,9 +192,31 @@ class KeptStates:
                     rows.append((part, until))
         return rows
 
-    def commit(self, new: ListedRows, outdated: Iterable[tuple[str, int]], total: int) -> None:
+    def contents(self) -> list[bytes]:
+        """Names of all contents that are stored."""
+        return list(self._count)
+
+    def named_after(self, named: Named, outdated: Iterable[tuple[str, int]]) -> tuple[list[bytes], list[bytes]]:
+        """Names of the contents that a commit adds, and of those that nothing names after it.
+
+        Args:
+            named: what its rows name.
+            outdated: rows that it deletes.
+        """
+        change = Counter(name for names in named.values() for name in names)
+        change.subtract(name for row in outdated for name in self._named.get(row, ()))
+        added = [name for name in change if name not in self._count]
+        return added, [name for name, by in change.items() if self._count[name] + by == 0]
+
+    def commit(self, new: ListedRows, named: Named, outdated: Iterable[tuple[str, int]], total: int) -> None:
         """Follow a commit, with what `total_after` and `outdated` have returned for it."""
         self.total = total
+        self._count.update(name for names in named.values() for name in names)
+        for name in [name for row in outdated for name in self._named.pop(row, ())]:
+            self._count[name] -= 1
+            if not self._count[name]:
+                del self._count[name]
+        self._named |= named
         for part, at in outdated:
             del self._rows[part][at]
             if not self._rows[part]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 
+from es_service.protocol.content import names_in
 from es_service.store import certifications
 from es_service.store.beginning import load_start
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
@@ -14,7 +16,7 @@ from es_service.store.folder import is_no_damage
 from es_service.store.platforms import sound_platforms
 from es_service.store.rows import history_rows
 from es_service.store.schema import RunMeta, load_meta
-from es_service.store.states import KeptRows, whole_states
+from es_service.store.states import KeptRows, Named, content_of, whole_states
 
 MOST_NAMED = 8
 """Most problems that a message names."""
@@ -30,7 +32,9 @@ class Verdict:
     good: int | None
     """Newest generation whose whole state is intact, and the history up to it as well; None if there is none."""
     kept: KeptRows
-    """Intact state rows."""
+    """Intact state rows, whose contents are intact, too."""
+    named: Named
+    """Names of contents in these rows, where there are any."""
     bad_rows: tuple[tuple[str, int], ...]
     """Damaged state rows as (part, generation), which must be deleted."""
     bad_certifications: tuple[certifications.Key, ...]
@@ -80,7 +84,10 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
 
     problems: list[str] = []
     count, sound = _history(connection, meta, first, problems)
-    kept, bad_rows = _state(connection, problems)
+    contents = _contents(connection, problems)
+    kept, named, bad_rows = _state(connection, contents, problems)
+    unnamed = contents.difference(*named.values())
+    problems += [f"the content {name.hex()} is named by nothing" for name in sorted(unnamed)]
     newest = count - 1 if count else None
     unfinished = sorted((part, at) for part, rows in kept.items() for at in rows if at >= count)
     problems += [f"state of {part!r} at generation {at} has no history row" for part, at in unfinished]
@@ -91,7 +98,7 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         problems.append(f"{which} not complete and intact")
     bad_certified = [key for key, row in certifications.rows(connection) if row is None]
     problems += [f"row {rank} of certification {number} is damaged" for number, rank in bad_certified]
-    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certified), tuple(problems))
+    return Verdict(meta, newest, good, kept, named, tuple(bad_rows), tuple(bad_certified), tuple(problems))
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:
@@ -110,20 +117,43 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
     return count, min([*bad, count])
 
 
-def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:
-    """Intact state rows, and (part, generation) of the damaged ones."""
+def _contents(connection: sqlite3.Connection, problems: list[str]) -> set[bytes]:
+    """Names of the intact contents."""
+    sound: set[bytes] = set()
+    for name, payload in connection.execute("SELECT name, payload FROM content"):
+        if content_of(name, payload) is not None:
+            sound.add(name)
+        else:
+            shown = name.hex() if isinstance(name, bytes) else repr(name)
+            problems.append(f"the content {shown} does not match its name")
+    return sound
+
+
+def _state(
+    connection: sqlite3.Connection, contents: Set[bytes], problems: list[str]
+) -> tuple[KeptRows, dict[tuple[str, int], frozenset[bytes]], list[tuple[str, int]]]:
+    """Intact state rows, what they name, and (part, generation) of the damaged ones.
+
+    Args:
+        contents: names of the intact contents.
+    """
     kept: KeptRows = {}
+    named: dict[tuple[str, int], frozenset[bytes]] = {}
     bad_rows: list[tuple[str, int]] = []
     for part, generation, sha256, payload in connection.execute("SELECT part, generation, sha256, payload FROM state"):
+        names = frozenset[bytes]()
         try:
             sound = part_sha256(part, generation, payload) == sha256
             if sound and payload != NO_PAYLOAD:
-                decode_part(payload)
+                names = names_in(decode_part(payload))
         except (ValueError, TypeError):
             sound = False
-        if sound:
+        if sound and names <= contents:
             kept.setdefault(part, {})[generation] = listed(sha256, payload)
+            if names:
+                named[part, generation] = names
         else:
-            problems.append(f"state of {part!r} at generation {generation} does not match its SHA-256")
+            what = "names a content that is missing or damaged" if sound else "does not match its SHA-256"
+            problems.append(f"state of {part!r} at generation {generation} {what}")
             bad_rows.append((part, generation))
-    return kept, bad_rows
+    return kept, named, bad_rows

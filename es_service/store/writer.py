@@ -14,6 +14,7 @@ import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.protocol.content import names_in
 from es_service.protocol.parent import require_same_process
 from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
@@ -32,8 +34,8 @@ from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound, patience
 from es_service.store.rows import history_rows, insert_history
-from es_service.store.schema import SCHEMA, SCHEMA_VERSION, RunMeta, put_meta
-from es_service.store.states import KeptStates, insert_state, sound_part
+from es_service.store.schema import RunMeta
+from es_service.store.states import KeptStates, insert_contents, insert_state, sound_content, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
@@ -77,7 +79,7 @@ class RunStore:
             self.generation = verdict.good
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
-                self._kept = KeptStates(self._connection, verdict.kept, verdict.good)
+                self._kept = KeptStates(self._connection, verdict.kept, verdict.named, verdict.good)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
             closing.callback(self.upkeep.finish)
@@ -125,13 +127,9 @@ class RunStore:
         """Names of the parts of the newest generation's state."""
         return self._kept.names()
 
-    def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
-        """State of the newest generation: part -> name -> array; empty before the first commit. Raises as `part`.
-
-        Args:
-            without: prefix of the names of parts that are left out; None to load all parts.
-        """
-        return {name: self.part(name) for name in self.names() if without is None or not name.startswith(without)}
+    def load(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """State of the newest generation: part -> name -> array; empty before the first commit. Raises as `part`."""
+        return {name: self.part(name) for name in self.names()}
 
     def part(self, name: str) -> dict[str, NDArray[Any]]:
         """One part of the newest generation's state: name -> array.
@@ -141,9 +139,23 @@ class RunStore:
             StoreError: the part has been damaged since the run was opened.
         """
         row = self._kept.newest(name)
+        with self._loading():
+            return sound_part(self._connection, name, *row)
+
+    def contents(self) -> list[bytes]:
+        """Names of the contents that the stored states name."""
+        return self._kept.contents()
+
+    def content(self, name: bytes) -> dict[str, NDArray[Any]]:
+        """A content that a stored state names, such as a policy: name -> array. Raises as `part`."""
+        with self._loading():
+            return sound_content(self._connection, name)
+
+    @contextlib.contextmanager
+    def _loading(self) -> Iterator[None]:
         with self._explaining("loading the state"):
             try:
-                return sound_part(self._connection, name, *row)
+                yield
             except Damaged as damage:
                 raise StoreError(
                     f"{self.folder / DATABASE} was damaged after it was opened: {damage}",
@@ -152,7 +164,12 @@ class RunStore:
                 ) from damage
 
     def commit(
-        self, generation: int, parts: Mapping[str, Part | None], history: Values, evaluations: Table = NO_ROWS
+        self,
+        generation: int,
+        parts: Mapping[str, Part | None],
+        history: Values,
+        evaluations: Table = NO_ROWS,
+        contents: Mapping[bytes, Part] = MappingProxyType({}),
     ) -> None:
         """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
@@ -161,10 +178,11 @@ class RunStore:
             parts: parts of the state that have changed, None for those that are removed; the others keep their values.
             history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
             evaluations: likewise for the centres that the generation evaluated, in the order of the asks: a table.
+            contents: contents by name, among them those that the parts name and that are not stored yet.
 
         Raises:
             DatabaseHeldError: another program holds the database. StoreError: the generation is not the next one, the
-                history does not fit the columns, or the disk is full.
+                history does not fit the columns, a part names a content that nobody has, or the disk is full.
         """
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
@@ -173,11 +191,17 @@ class RunStore:
         new = rows_listed(rows)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
         total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
+        named = {(part, generation): names for part, arrays in parts.items() if (names := names_in(arrays or {}))}
+        added, unnamed = self._kept.named_after(named, outdated)
+        if lacking := [name.hex() for name in added if name not in contents]:
+            raise StoreError(f"{self.folder}: generation {generation} names {lacking[0]}, which nobody has")
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as connection:
             # Delete first, so that the new rows use the pages of the old ones.
             connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
+            connection.executemany("DELETE FROM content WHERE name = ?", [(name,) for name in unnamed])
             insert_state(connection, rows)
+            insert_contents(connection, ((name, contents[name]) for name in added))
             self._hook("mid_transaction")
             insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
             if self._recorded:
@@ -185,7 +209,7 @@ class RunStore:
             self._hook("before_commit")
         self._recorded = False
         self.generation = generation
-        self._kept.commit(new, outdated, total)
+        self._kept.commit(new, named, outdated, total)
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(rows))
         self.upkeep.after_commit()
@@ -232,7 +256,6 @@ class RunStore:
         StoreError if the database cannot be written."""
         number = self.next_certification
         with self._transaction("storing a certification") as connection:
-            put_meta(connection, SCHEMA, str(SCHEMA_VERSION))  # from here on, older versions cannot read all rows
             certifications.insert(connection, number, policies)
         self.upkeep.after_commit()
 

@@ -23,8 +23,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from es_service.errors import ConfigError, ServiceError
-from es_service.loop.parts import elite_part
-from es_service.report.data import TRACE, RunData
+from es_service.report.data import RunData
 from es_service.report.maps import path_lines
 from es_service.report.page import Evaluate, asset
 from es_service.report.replays import replay_section
@@ -145,9 +144,9 @@ class Site:
         if data.map is None or cell not in data.map.cell_N:
             raise HTTPException(404, "this cell is empty")
         try:
-            part = elite_part(cell)
-            paths = {cell: open_run(run.folder).parts(wanted=lambda name: name == part)[1][part][TRACE]}
-        except (ServiceError, KeyError):  # it is damaged, which the page says
+            _, elites = open_run(run.folder).elites(lambda snapshot: [cell])
+            paths = {cell: elite.trace_T_B for cell, elite in elites.items()}
+        except (ServiceError, KeyError):  # it is damaged, or empty now, which the page says
             paths = {}
         path = path_lines(replace(data, paths=paths))
         return path | {"evaluate": self._evaluate(run.folder)(data.cell_name(cell))}

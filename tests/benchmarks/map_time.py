@@ -14,7 +14,7 @@ import multiprocessing
 import resource
 import tempfile
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,16 @@ from es_service import api
 from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec
 from es_service.loop import driver
+from es_service.loop.arrays import state_of, stored
 from es_service.loop.history import history_columns
-from es_service.loop.parts import Arrays, cell_part, elite_part, elite_to_arrays
+from es_service.loop.state import RunState
+from es_service.protocol.content import Arrays, name_of, names, policy_content
 from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
-from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.maps.behaviour_map import Elite
+from es_service.search.maps.behaviour_map import columns_of
 from es_service.search.observation_statistics import no_observations
-from es_service.store import writer
 from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
@@ -71,19 +72,24 @@ class Inventing(AtTheEnd):
         return addressed((subject, chunk), result)
 
 
-def filled(parts: dict[str, Arrays], parameters: int, observations: int) -> dict[str, Arrays]:
-    """The parts of generation 0 with an elite in every cell."""
-    rng = np.random.default_rng(1)
-    known = [name for name in parts if name.startswith("cell_")]
-    first = dict(parts[known[0]])
-    for cell in range(CELLS[0] * CELLS[1]):
-        if cell_part(cell) not in parts:
-            order = np.asarray(sum(name.startswith("cell_") for name in parts), np.int64)
-            parts[cell_part(cell)] = first | {"order": order, "fitness": np.asarray(-1e6)}
-            numbers = rng.normal(size=parameters).astype(np.float32)
-            zeros, ones = np.zeros(observations, np.float32), np.ones(observations, np.float32)
-            parts[elite_part(cell)] = elite_to_arrays(Elite(numbers, zeros, ones, np.zeros((64, 2), np.float32)))
-    return parts
+def filled(state: RunState, spec: PolicySpec, contents: dict[bytes, Arrays]) -> RunState:
+    """The state of generation 0 with an elite in every cell, whose policies and traces are added to some contents."""
+    rng, map_ = np.random.default_rng(1), state.search.map
+    assert map_ is not None
+    count, size = CELLS[0] * CELLS[1], spec.widths[0]
+    rows = np.concatenate([np.arange(map_.size), np.zeros(count - map_.size, np.int64)])
+    columns = {name: values[rows] for name, values in columns_of(map_).items()}
+    columns["cell_N"] = np.concatenate([map_.cell_N, np.setdiff1d(np.arange(count), map_.cell_N)])
+    columns["fitness_N"][map_.size :] = -1e6
+    trace = {"trace_T_B": np.zeros((64, 2), np.float32)}
+    policies = [
+        policy_content(spec, *(rng.normal(size=size).astype(np.float32) for size in (spec.parameters, size, size)))
+        for _ in range(count - map_.size)
+    ]
+    contents |= {name_of(content): content for content in (trace, *policies)}
+    columns["policy_N"][map_.size :] = names(map(name_of, policies))
+    columns["trace_N"][map_.size :] = names([name_of(trace)] * len(policies))
+    return replace(state, search=replace(state.search, map=replace(map_, **columns)))
 
 
 def prepared(environment: str, hidden: list[int], algorithm: str, generations: int, enabled: bool) -> tuple[Any, ...]:
@@ -110,9 +116,9 @@ def fill(place: Path, *case: Any) -> None:
     memory = MemoryStore()
     with contextlib.suppress(_Enough):
         driver.drive(driver.run(search, memory, None, _stop), invented)
-    parts = memory.parts
+    state, contents = state_of(memory.parts, 0, 0.0), dict(memory.contents)
     if config.map.enabled:
-        parts = filled(parts, policy_spec(config, search.task).parameters, search.task.observation_size)
+        state = filled(state, policy_spec(config, search.task), contents)
     columns = history_columns(search.task, config.map.enabled)
     meta = RunMeta(
         f"{0:032x}",
@@ -122,7 +128,7 @@ def fill(place: Path, *case: Any) -> None:
         asdict(search.task),
         columns,
     )
-    beginning = Beginning(history=[memory.rows[0]], parts=parts, newest=0)
+    beginning = Beginning(history=[memory.rows[0]], parts=stored(state), contents=contents, newest=0)
     RunStore.create(place, config.resolved_yaml(), meta, beginning).close()
 
 
@@ -134,15 +140,15 @@ def measure(place: Path, *case: Any) -> dict[str, Any]:
     started = time.perf_counter()
     with RunStore.open(place) as store:
         opened_s = time.perf_counter() - started
-        encode = writer.encode_changes
+        commit = store.commit
 
-        def encode_changes(generation: int, parts: Any) -> list[Any]:
-            encoded = encode(generation, parts)
-            sizes.append(sum(len(payload) for *_, payload in encoded))
-            return encoded
+        def measured(generation: int, parts: Any, history: Any, evaluations: Any, contents: Any) -> None:
+            changed = [part for part in parts.values() if part is not None]
+            sizes.append(sum(array.nbytes for part in (*changed, *contents.values()) for array in part.values()))
+            commit(generation, parts, history, evaluations, contents)
 
-        writer.encode_changes = encode_changes
-        driver.drive(driver.run(search, store, driver.stored_state(store, search.task), rows.append), invented)
+        store.commit = measured
+        driver.drive(driver.run(search, store, driver.stored_state(store), rows.append), invented)
     driver_ms, store_ms = (
         round(float(np.median([row[f"seconds_{part}"] for row in rows[5:]])) * 1e3, 2) for part in ("driver", "store")
     )

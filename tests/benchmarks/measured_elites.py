@@ -78,7 +78,7 @@ def measured(kind: str, seed: int, steps: int, folder: Path, overrides: list[str
         "seed": seed,
         "env_steps": int(last["env_steps"]),
         "generations": int(run.history.index[-1]),
-        "kept": len(run.parts()[1].get("whole_kept", {}).get("serial_K", run.map)),
+        "kept": len(run.at().nodes.get("extra/kept", {}).get("serial_K", run.map)),
         "samples": float(run.map["samples"].mean()) if "samples" in run.map else 1.0,
         **stored,
         **corrected_values,

@@ -145,7 +145,7 @@ def contents(run: Path) -> dict[str, np.ndarray]:
     opened_run = open_run(run)
     arrays = {
         f"state/{part}/{name}": values
-        for part, values_of in opened_run.parts()[1].items()
+        for part, values_of in opened_run.at().nodes.items()
         for name, values in values_of.items()
     }
     for column, values in opened_run.history.items():

@@ -13,7 +13,8 @@ from es_service.asking import Asked
 from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, EvaluationError
-from es_service.loop.parts import OBSERVATIONS, moments_from_arrays
+from es_service.loop.arrays import OBSERVATIONS, value_of
+from es_service.protocol.messages import Moments
 from es_service.report.settings import changed_settings
 from es_service.runs.polishing import polish_config
 from es_service.store.digest import digest_parts
@@ -139,7 +140,7 @@ def test_of_several_populations_all_observations_are_told_once_or_not_at_all(tmp
                 given = moments if asked.trains.any() else None
                 steps = np.full(len(asked), 7)
                 search.tell(asked, np.arange(len(asked)), np.zeros((len(asked), 1)), steps=steps, moments=given)
-            return moments_from_arrays(search.run.parts(wanted=lambda part: part == OBSERVATIONS)[1][OBSERVATIONS])
+            return value_of(Moments, search.run.at(wanted=[OBSERVATIONS]).nodes, OBSERVATIONS)
 
     assert told("none", None).count == 0
     after = told("some", (1e8, [3.0, -1.0], [4e8, 0.25e8]))

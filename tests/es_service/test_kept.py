@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from es_service.protocol.content import NAME
 from es_service.search.maps.behaviour_map import empty_map
 from es_service.search.maps.geometry import Grid
 from es_service.search.maps.kept import (
@@ -35,6 +36,7 @@ def policies(*values, first=0, generation=0):
         np.full(count, generation),
         numbers,
         np.full(count, np.nan),
+        *np.zeros((2, count), NAME),
     )
 
 
@@ -95,13 +97,11 @@ def test_the_map_is_the_top_layer_in_the_order_of_filling():
     first = top_layer(kept, empty_map(LINE, counts_samples=True))
     assert first.cell_N.tolist() == [7, 3, 5]  # by the numbers 0, 2 and 3
     assert first.centre_N.tolist() == [0, 2, 3]
-    assert first.order_N is None
     gone = at_rows(kept, kept.cell_K != 3)
     more = put(gone, policies((1, 1.5), (9, 5.1), (2, 0.5), first=4, generation=1), LINE, 2)
     second = top_layer(more, first)
     assert second.cell_N.tolist() == [7, 5, 1, 0]
     assert second.centre_N.tolist() == [0, 5, 4, 6]
-    assert second.order_N.tolist() == [0, 2, 3, 4]
     assert second.samples_N.tolist() == [1, 1, 1, 1]
     assert second.fitness_N.tolist() == [1.0, 9.0, 1.0, 2.0]
     assert top_layer(empty_kept(1), first).size == 0

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from es_service import open_run
-from es_service.loop.parts import BLOCK_PREFIX, archive_to_parts
+from es_service.loop.arrays import names_of, state_of, stored
 from es_service.report.data import read_run
 from es_service.runs.export import tables
 from es_service.search.novelty import archive_of
@@ -31,10 +32,13 @@ def long_run(folder: Path, generations: int) -> Path:
     """A run with the rows of a short one again and again, and with its last state."""
     short = write_run(folder / "short", generations=20)
     rows, centres = reader.read_history(short), reader.read_evaluations(short)
-    newest, parts = reader.read_parts(short)
+    newest, parts, _ = reader.read_parts(short)
+    state = state_of(parts, newest, 0.0)
+    named = names_of(parts)
+    contents = reader.read_parts(short, named=lambda at, parts: named)[2]
     count = np.arange(generations)
     archive = archive_of(np.random.default_rng(0).uniform(-1, 1, (generations, 2)), count, 0 * count)
-    parts = {name: part for name, part in parts.items() if not name.startswith(BLOCK_PREFIX)}
+    state = replace(state, search=replace(state.search, archive=archive))
 
     def history() -> Iterator[dict[str, Any]]:
         for generation in range(generations):
@@ -42,7 +46,8 @@ def long_run(folder: Path, generations: int) -> Path:
 
     beginning = Beginning(
         history=history(),
-        parts=parts | archive_to_parts(archive, 0),
+        parts=stored(state),
+        contents=contents,
         newest=generations - 1,
         evaluations=(centres[generation % newest] for generation in range(generations)),
     )

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.loop.parts import BLOCK_ENTRIES, archive_from_parts, archive_to_parts, block_part
 from es_service.search import novelty as search_novelty
 from es_service.search.novelty import (
     COPIES,
@@ -17,7 +16,6 @@ from es_service.search.novelty import (
     empty_archive,
     extended,
     novelty,
-    same_entries,
     sound_archive,
 )
 from tests.references import novelty_search as reference
@@ -36,16 +34,7 @@ def archive_of(descriptors, dimensions=2) -> NoveltyArchive:
 def many(descriptor_N_B) -> NoveltyArchive:
     """An archive made in one go, as a resumed run makes it."""
     entries = np.asarray(descriptor_N_B, np.float64)
-    blocks = range(0, len(entries), BLOCK_ENTRIES)
-    parts = {
-        block_part(i): {
-            "descriptor_N_B": entries[first : first + BLOCK_ENTRIES],
-            "generation_N": np.arange(first, min(first + BLOCK_ENTRIES, len(entries))),
-            "centre_N": np.zeros(min(BLOCK_ENTRIES, len(entries) - first), np.int64),
-        }
-        for i, first in enumerate(blocks)
-    }
-    return archive_from_parts(parts, entries.shape[1])
+    return search_novelty.archive_of(entries, np.arange(len(entries)), np.zeros(len(entries), np.int64))
 
 
 def of(archive, queries, neighbours=2, distance="euclidean", exclude=None):
@@ -241,23 +230,6 @@ def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch, off):
     assert len(undecided) > 10  # a grid is full of ties
 
 
-@settings(max_examples=20)
-@given(st.integers(0, 3 * BLOCK_ENTRIES), st.integers(0, BLOCK_ENTRIES + 20))
-def test_parts_hold_all_of_it_and_only_changed_blocks_are_written(before, more):
-    rng = np.random.default_rng(before)
-    old = many(rng.normal(size=(before, 2)))
-    new = old
-    for index in range(more):
-        new = extended(new, rng.normal(size=2), before + index, index % 5)
-    changed = archive_to_parts(new, before)
-    assert len(changed) <= 1 + math.ceil(more / BLOCK_ENTRIES)
-    again = archive_from_parts(archive_to_parts(old, 0) | changed, 2)
-    for name in ("descriptor_N_B", "generation_N", "centre_N"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(new, name))
-    queries = rng.normal(size=(20, 2))
-    assert of(again, queries, 10) == of(new, queries, 10)
-
-
 def test_an_archive_that_a_search_has_cut_is_one_of_its_own_entries():
     """Its arrays may begin where those of the archive before do, and still be others."""
     whole = empty_archive(2)
@@ -267,6 +239,5 @@ def test_an_archive_that_a_search_has_cut_is_one_of_its_own_entries():
     columns = {name: getattr(whole, name)[::2] for name in ("descriptor_N_B", "generation_N", "centre_N")}
     thinned = sound_archive(replace(whole, **columns, tree=None))
     np.testing.assert_array_equal(thinned.generation_N, np.arange(0, 100, 2))
-    assert same_entries(thinned, whole) == 1
     with pytest.raises(ValueError, match="arrays of the novelty archive"):
         sound_archive(replace(whole, generation_N=whole.generation_N[:50]))

@@ -72,7 +72,7 @@ def test_they_outlive_a_stop_and_a_fork_to_the_bit(tmp_path):
     forked = api.fork(tmp_path / "parent", ["budget.generations=6"], out=tmp_path / "fork", generation=3).run
     assert forked.digest() == whole.digest()
     for run in (whole, forked, api.open_run(tmp_path / "parts")):
-        extra = run.parts()[1]["own"]
+        extra = run.at().nodes["extra"]
         assert (extra["count"], extra["heard"].size, extra["sum"].dtype) == (7, 7, np.float32)
         np.testing.assert_array_equal(extra["heard"], run.history["centre_fitness_mean"])
         assert extra["sum"] == pytest.approx(extra["heard"].sum(), rel=1e-5)
@@ -80,8 +80,7 @@ def test_they_outlive_a_stop_and_a_fork_to_the_bit(tmp_path):
 
 def test_they_are_in_the_digest(tmp_path):
     parts = [digest_parts(begin(tmp_path / name, name).folder) for name in ("counting", "counting_otherwise")]
-    assert {name for name in parts[0] if parts[0][name] != parts[1][name]} == {"state/own"}
-    assert "state/own" not in digest_parts(begin(tmp_path / "es", "watching").folder), "a search without any has none"
+    assert {name for name in parts[0] if parts[0][name] != parts[1][name]} == {"state/extra"}
 
 
 def watching(config):
@@ -122,7 +121,7 @@ def test_they_cannot_be_changed_in_place_also_after_a_resume(tmp_path):
 def test_a_part_that_nothing_changes_is_written_once(tmp_path):
     folder = begin(tmp_path / "run", "idle").folder
     api.resume(folder, ["budget.generations=8"])
-    assert execute(folder, "SELECT generation FROM state WHERE part = 'own'") == [(0,)]
+    assert execute(folder, "SELECT generation FROM state WHERE part = 'extra#000000'") == [(0,)]
 
 
 def idle(config):
@@ -166,7 +165,7 @@ def test_other_names_types_and_shapes_are_stored(tmp_path, name):
     begin(tmp_path / "parts", name, generations=2)
     resumed = api.resume(tmp_path / "parts", ["budget.generations=6"]).run
     assert resumed.digest() == whole.digest()
-    extra = resumed.parts()[1]["own"]
+    extra = resumed.at().nodes["extra"]
     kinds = {name: (str(array.dtype), array.shape) for name, array in extra.items()}
     n, x = {"n": ("int64", ())}, {"x": ("float64", (2,))}
     assert (
@@ -184,7 +183,7 @@ def test_other_names_types_and_shapes_are_stored(tmp_path, name):
 def test_what_is_no_array_of_numbers_ends_the_run(tmp_path, name, kind):
     with pytest.raises(StoreError, match="generation 2 cannot be stored") as error:
         begin(tmp_path / "run", name)
-    assert f"its own value 'x' is {kind}; it must be a NumPy array of bools or numbers" in str(error.value)
+    assert f"its own value 'x' is {kind}; it must be a NumPy array of bools, numbers" in str(error.value)
     assert "Everything up to generation 1 is saved" in str(error.value)
     assert api.open_run(tmp_path / "run").generation == 1
 

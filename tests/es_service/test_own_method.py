@@ -65,7 +65,7 @@ def written(tmp_path, monkeypatch):
 
 
 def restarts(run) -> int:
-    return int(run.parts()[1]["own"]["restarts"][0])
+    return int(run.at().nodes["extra"]["restarts"][0])
 
 
 def test_its_declarations_are_those_of_the_service(tmp_path):

@@ -15,7 +15,6 @@ from es_service.report.write import write_report
 from es_service.runs import verification
 from es_service.runs.export import export
 from es_service.runs.replay import record
-from es_service.search.state_parts import from_parts
 from tests.system.session import finish
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -60,7 +59,7 @@ def test_elites_fall_move_and_leave(run):
     left = sum(len(before.keys() - after.keys()) for before, after in pairs)
     assert moved >= 3
     assert left >= 3
-    counted = sum(int(entry["count"]) for entry in from_parts(run.parts()[1])["left"].entries.values())
+    counted = sum(int(count) for count in run.at().nodes["extra/left"].values())
     assert 0 < counted <= moved + left
     assert run.history["qd_score"].diff().min() < 0.0
 
@@ -86,9 +85,9 @@ def test_an_entry_is_the_mean_of_its_samples_wherever_it_is(run):
 
 
 def test_the_policy_of_an_elite_is_that_of_its_first_evaluation(run):
-    centres = [run.parts(generation)[1]["centre_0"]["centre_D"] for generation in range(GENERATIONS + 1)]
+    centres = [run.at(generation).nodes["centres/0"]["centre_D"] for generation in range(GENERATIONS + 1)]
     for generation in (10, 20, GENERATIONS):
-        map_, elites = run.at(generation).elites()
+        map_, elites = run.elites(generation=generation)
         assert set(elites) == set(map_.cell_N.tolist())
         for cell, of, centre in zip(map_.cell_N.tolist(), map_.generation_N, map_.centre_N, strict=True):
             assert centre == 0

@@ -246,16 +246,17 @@ def test_a_damaged_history_row_is_left_out_and_named(tmp_path):
 
 def test_a_damaged_elite_loses_its_path_only(tmp_path):
     folder = write_run(tmp_path / "run")
-    cell = int(read_run(folder).map.cell_N[0])
-    data = damaged(folder, "UPDATE state SET payload = 'x' WHERE part = ?", f"elite_{cell:08d}")
+    map_ = read_run(folder).map
+    cell = int(map_.cell_N[0])
+    data = damaged(folder, "UPDATE content SET payload = 'x' WHERE name = ?", map_.trace_N[0].tobytes())
     assert cell not in data.paths
     assert len(data.paths) == data.map.size - 1
-    assert data.problems == (f"the state of elite_{cell:08d} is damaged",)
+    assert data.problems == ("1 of the policies and paths that its state names are damaged or missing",)
 
 
 def test_without_the_newest_state_rows_the_run_is_shown_and_said_to_be_incomplete(tmp_path):
     folder = write_run(tmp_path / "run")
-    data = damaged(folder, "DELETE FROM state WHERE part = 'map'")
+    data = damaged(folder, "DELETE FROM state WHERE part LIKE 'map/geometry%'")
     assert data.map is None
     assert data.history["generation"].size == 21
     assert data.problems[0] == "the state of generation 20 is incomplete"

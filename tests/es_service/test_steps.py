@@ -8,10 +8,8 @@ import pytest
 from es_service import api
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, PlainStep
 from es_service.errors import StoreError
-from es_service.loop.parts import centre_to_arrays
-from es_service.runs.strangers import policy_spec, require_forms
+from es_service.runs.strangers import policy_spec, sound_nodes
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import CentreState
 from es_service.search.steps import STEPS, restarted
 from tests.es_service.store_examples import CONSTANTS, meta
 
@@ -29,10 +27,7 @@ ADAM = {"adam_m_D", "adam_v_D", "adam_step"}
 
 def step_arrays(run) -> list[dict[str, np.ndarray]]:
     """What each centre's step remembers."""
-    parts = run.parts()[1]
-    return [
-        {name: parts[f"centre_{index}"][name] for name in ADAM & parts[f"centre_{index}"].keys()} for index in (0, 1)
-    ]
+    return [run.at().nodes[f"centres/{index}/step"] for index in (0, 1)]
 
 
 @pytest.mark.parametrize("settings", [AdamStep(), AdamWStep(), PlainStep(), ClipUpStep()])
@@ -100,11 +95,11 @@ def test_every_method_with_a_gradient_takes_every_part(algorithm, tmp_path):
 def test_a_stored_centre_has_the_arrays_of_its_step(tmp_path, kind):
     run = meta(constants=CONSTANTS | {"search.step.kind": kind})
     size = policy_spec(run).parameters
-    arrays = centre_to_arrays(CentreState(np.zeros(size, np.float32), STEPS[kind].fresh(size)))
-    require_forms(tmp_path, run, {"centre_0": arrays | {"of_user_D": arrays["centre_D"]}})
-    for name, values in STEPS[kind].fresh(size).items():
+    arrays, node = STEPS[kind].fresh(size), "centres/0/step"
+    sound_nodes(tmp_path, run, {node: {**arrays, "of_user_D": np.zeros(size, np.float32)}}, [node])
+    for name, values in arrays.items():
         without = {other: array for other, array in arrays.items() if other != name}
         forged = [values.astype(str)] + ([np.int64(-1), np.int64(2**62)] if values.dtype.kind == "i" else [])
-        for wrong, what in [(without, "lacks"), *((arrays | {name: np.asarray(value)}, "has") for value in forged)]:
-            with pytest.raises(StoreError, match=f"centre_0 {what} .*array .?{name}"):
-                require_forms(tmp_path, run, {"centre_0": wrong})
+        for wrong, what in [(without, "lacks"), *(({**arrays, name: np.asarray(value)}, "has") for value in forged)]:
+            with pytest.raises(StoreError, match=f"{node} {what} .*array .?{name}"):
+                sound_nodes(tmp_path, run, {node: wrong}, [node])

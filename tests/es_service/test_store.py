@@ -193,7 +193,7 @@ def test_the_state_of_the_last_two_generations_is_kept_and_no_more(tmp_path):
                     del expected[0]  # a row that removes a part is kept only with an older one
                 assert sorted(at for name, at in kept if name == part) == expected
     for generation in (10, 11):
-        at, parts = read_parts(folder, generation)
+        at, parts, _ = read_parts(folder, generation)
         assert at == generation
         assert_same_state(parts, state_at(generation))
 
@@ -261,7 +261,7 @@ def test_a_log_that_a_reader_holds_back_is_told_once_and_cut_afterwards(tmp_path
 def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
     history = [history_row(generation) for generation in range(4)]
     platforms = [(0, {"jax": "1"}), (2, {"jax": "2"})]
-    beginning = Beginning(iter(history), state_at(3), platforms, newest=3, evaluations=map(evaluated, range(4)))
+    beginning = Beginning(iter(history), state_at(3), {}, platforms, newest=3, evaluations=map(evaluated, range(4)))
     with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         assert run.generation == 3
         assert run.start is None

@@ -224,7 +224,6 @@ def shown(report: RunData) -> set[Any]:
     map_ = {} if report.map is None else {field.name: getattr(report.map, field.name) for field in fields(report.map)}
     map_ = {name: values for name, values in map_.items() if values is not None}
     geometry = map_.pop("geometry", None)
-    map_.pop("order_N", None)  # with gaps where an entry cannot be read
     single = {"best": report.best, "geometry": geometry, "description": report.meta}
     found = {(name, repr(value)) for name, value in single.items() if value is not None}
     if report.status.row:

@@ -30,8 +30,6 @@ from es_service.runs.intervals import false_pass_share, mean_interval
 from es_service.runs.selection import Episodes
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
-from es_service.store.schema import get_meta
-from tests.database import as_0_23_wrote_it, database
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
@@ -242,36 +240,6 @@ def test_a_certification_neither_reaches_the_target_nor_stands_for_the_run_s_own
     assert [one.decides for one in all_certifications(run.folder)] == [False, True, False]
 
 
-def test_certifications_of_a_run_of_0_23_are_read_and_it_remains_over(tmp_path):
-    """Until then, a certification did not say whether it decided something; its episodes decided and were quoted."""
-    config = api.load_config(CONFIG, ["budget.target_certified=-1000"])
-    run = api.run(config, tmp_path / "run").run
-    digest = run.digest()
-    as_0_23_wrote_it(run.folder)
-    [policy] = certified_policies(run.folder)
-    assert (policy.decides, policy.tries, policy.name, len(policy.episodes.return_E)) == (None, 0, "best", 256)
-    assert run.certified["return_mean"].tolist() == [policy.row()["return_mean"]]
-    assert run.policy("certified").parameters_D.tolist() == policy.parameters_D.tolist()
-    assert run.decisions.empty
-    reason = api.resume(run.folder).reason
-    assert reason.startswith("the target -1000 is reached")
-    assert "certify it again" in reason
-    [again] = certify_run(run.folder, top=0)
-    assert [one.decides for one in certified_policies(run.folder)] == [None, False]
-    assert again.number == policy.number + 1
-    assert run.digest() == digest
-    assert get_schema(run.folder) == "8", "older versions say that it cannot read the new rows"
-
-
-def test_what_0_23_selected_and_certified_decides_no_resume(tmp_path):
-    folder = api.run(api.load_config(CONFIG, ["budget.target_certified=-1000"]), tmp_path / "run").run.folder
-    as_0_23_wrote_it(folder, candidates=11)
-    [policy] = certified_policies(folder)
-    assert policy.decides is False
-    assert target_reached(folder, -1000, "sum") == ""
-    assert "(try 1 so far, with any target)" in api.resume(folder).reason
-
-
 def test_of_several_decisions_that_reach_a_target_the_newest_counts(tmp_path):
     folder = api.run(api.load_config(CONFIG, ["budget.target_certified=-1000"]), tmp_path / "run").run.folder
     decision, report = all_certifications(folder)
@@ -279,11 +247,6 @@ def test_of_several_decisions_that_reach_a_target_the_newest_counts(tmp_path):
     assert targets.passed([decision, report, *later], -1000, "sum") is later[0]
     assert targets.report_of([decision, report, *later], later[0]) is later[1]
     assert targets.report_of([decision, report, later[0]], later[0]) is None, "that of the one before is older"
-
-
-def get_schema(folder):
-    with database(folder / "run.db") as connection:
-        return get_meta(connection, "schema_version")
 
 
 def made_up_episodes(kind, rng, mean):

@@ -127,8 +127,8 @@ def test_a_bit_that_is_flipped_now_is_found_as_well_and_the_part_is_named(tmp_pa
     assert not any(one.differences for one in before)
     assert last.last == 12
     parts = [name for name in last.differences if name.startswith("state/")]
-    assert any(name.startswith("state/centre_") for name in parts)
-    assert not {"state/map_geometry", "state/observations"} & set(parts)
+    assert any(name.startswith("state/centres/") for name in parts)
+    assert not {"state/map/geometry#000000", "state/observations"} & set(parts)
     assert any(" instead of " in name for name in last.differences)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from es_service import api
 from es_service.errors import DatabaseHeldError, EvaluationError, Interrupted
+from es_service.protocol.content import name_of, names
 from es_service.runs import waiting
 from es_service.runs.certification import certify_run
 from es_service.runs.run_status import read_status, state
@@ -23,10 +24,8 @@ from tests.es_service.store_examples import (
     create,
     digest,
     evaluated_table,
-    finished,
     history_row,
     parts_of,
-    state_at,
 )
 
 CONFIG = {
@@ -160,25 +159,41 @@ def held(folder, tell=lambda notice: None, should_stop=lambda: None, generations
 
 def give(patient, first, last):
     for generation in range(first, last + 1):
-        patient.commit(generation, parts_of(generation), history_row(generation), evaluated_table(generation))
+        row = history_row(generation)
+        patient.commit(generation, with_policy(generation)[0], row, evaluated_table(generation), policy(generation))
 
 
-def test_the_loop_reads_the_newest_parts_whether_they_wait_or_not(tmp_path):
+def policy(generation):
+    """The policy that a generation brings, by its name."""
+    content = {"parameters_D": np.full(3, generation // 2, np.float32)}
+    return {name_of(content): content}
+
+
+def with_policy(generation):
+    """What a generation changes, with the name of its policy."""
+    return {**parts_of(generation), "named": {"policy": names(policy(generation))}}, policy(generation)
+
+
+def test_the_loop_reads_policies_whether_they_wait_or_not(tmp_path):
     with held(tmp_path / "run") as (patient, store, viewer):
         for last in range(3, 9):
             give(patient, last, last)
-            for name in ("centre_0", "centre_1", "centre_2", "guest"):
-                if (expected := state_at(last).get(name)) is None:
-                    with pytest.raises(KeyError):
-                        patient.part(name)
-                else:
-                    for array_name, array in patient.part(name).items():
-                        np.testing.assert_array_equal(array, expected[array_name])
+            for generation in range(3, last + 1):
+                [(name, content)] = policy(generation).items()
+                np.testing.assert_array_equal(patient.content(name)["parameters_D"], content["parameters_D"])
         assert store.generation == 2
         viewer.leave()
         give(patient, 9, 9)
         assert store.generation == 9
-    assert digest(tmp_path / "run") == digest(finished(tmp_path / "whole", 10))
+        assert patient.content(*policy(9))["parameters_D"][0] == 4
+        assert set(store.contents()) == {*policy(8), *policy(9)}
+        with pytest.raises(KeyError):
+            patient.content(*policy(3))
+    with create(tmp_path / "whole", generations=3) as whole:
+        for generation in range(3, 10):
+            parts, contents = with_policy(generation)
+            whole.commit(generation, parts, history_row(generation), evaluated_table(generation), contents)
+    assert digest(tmp_path / "run") == digest(tmp_path / "whole")
 
 
 def test_a_run_pauses_when_more_waits_than_memory_may_hold(tmp_path, monkeypatch):

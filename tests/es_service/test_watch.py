@@ -182,9 +182,10 @@ def test_threads_that_read_a_run_at_once_read_each_generation_once(tmp_path, mon
 
 def test_a_damaged_run_shows_what_is_left(tmp_path):
     folder = write_run(tmp_path / "runs/a", generations=40)
+    [(sha256,)] = execute(folder, "SELECT sha256 FROM history WHERE generation = 20")
     content = bytearray((folder / "run.db").read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 4096] = bytes(4096)
+    middle = content.index(sha256.encode())
+    content[middle - 400 : middle + 40] = bytes(440)
     (folder / "run.db").write_bytes(content)
     reading = Reading(Runs([tmp_path]).find()[0])
     whole = read_run(folder, paths=False, digest=False)

@@ -17,7 +17,6 @@ from es_service.search.algorithms.common import novelty_search
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
 from es_service.search.maps.behaviour_map import resampled
-from es_service.search.state_parts import ByCell
 
 DRAW = 100
 """Last id of the random stream of Domain.SELECTION that draws the elites; those of shipped searches are below."""
@@ -47,13 +46,12 @@ def reevaluated_elites(config: RunConfig) -> Algorithm:
         return np.unique(state.map.cell_N[(drawn_N * state.map.size).astype(int)]).tolist()
 
     def ask(state: SearchState, generation: int) -> tuple[Ask | PolicyAsk, ...]:
-        elites = list(state.elites.values())  # those of the cells that `drawn` has named, in its order
-        names = ("centre_D", "observation_mean_O", "observation_std_O")
-        policies = [PolicyAsk(*(np.stack([getattr(one, name) for one in elites]) for name in names))] if elites else []
+        rows = [state.map.row_of(cell) for cell in drawn(state, generation)]
+        policies = [PolicyAsk(state.map.policy_N[rows])] if rows else []  # asked for by name
         return (*shared.ask(state, generation), *policies)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-        count, before, map_, left = len(state.centres), state.map, state.map, dict(state.extra["left"].entries)
+        count, before, map_, left = len(state.centres), state.map, state.map, dict(state.extra["left"])
         samples = [one for one in evaluations if one.centre >= count]
         for cell, one in zip(drawn(state, evaluations[0].generation), samples, strict=bool(samples)):
             row = before.row_of(cell)
@@ -61,8 +59,8 @@ def reevaluated_elites(config: RunConfig) -> Algorithm:
                 continue  # another elite that was measured again has taken its place
             map_, at, is_there = resampled(map_, cell, one.descriptor_B, one.fitness, one.episodes)
             if at != cell or not is_there:
-                left[cell] = {"count": left.get(cell, {"count": np.array(0)})["count"] + 1}
-        state = replace(state, map=map_, extra={"left": ByCell(left)})
+                left[str(cell)] = left.get(str(cell), np.array(0)) + 1
+        state = replace(state, map=map_, extra={"left": left})
         return shared.tell(state, tuple(one for one in evaluations if one.centre < count))
 
-    return replace(shared, ask=ask, parents=drawn, tell=tell, counts_samples=True, extra={"left": ByCell()})
+    return replace(shared, ask=ask, tell=tell, counts_samples=True, extra={"left": {}})

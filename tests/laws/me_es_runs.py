@@ -80,8 +80,8 @@ class Remembering(MemoryStore):
         super().__init__()
         self.after, self.evaluated = [], []
 
-    def commit(self, generation, parts, history, evaluations):
-        super().commit(generation, parts, history, evaluations)
+    def commit(self, generation, parts, history, evaluations, contents):
+        super().commit(generation, parts, history, evaluations, contents)
         self.after.append(dict(self.parts))
         self.evaluated.append(rows_of(evaluations))
 
@@ -96,9 +96,7 @@ def run_in_memory(config, evaluator=None, store=None, algorithm=None):
     search = driver.Search(
         config, algorithm, lambda: (first_centres(config), no_observations(2)), SHIPPED["point_maze"]
     )
-    state, _ = driver.drive(
-        driver.run(search, store, driver.stored_state(store, search.task), lambda row: None), evaluator
-    )
+    state, _ = driver.drive(driver.run(search, store, driver.stored_state(store), lambda row: None), evaluator)
     return state, store, evaluator
 
 

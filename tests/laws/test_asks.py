@@ -147,10 +147,6 @@ def test_what_is_no_state_is_an_error_with_a_sentence(function, returned):
         run_in_memory(config, algorithm=algorithm)
 
 
-EVERY_CELL = list(range(400))
-"""All cells of the map, most of which are empty."""
-
-
 @pytest.mark.parametrize(
     ("function", "returned", "sentence"),
     [
@@ -164,14 +160,6 @@ EVERY_CELL = list(range(400))
         ("start_cells", {0: 1.5}, r"returned \[1\.5\] as cells; it must return whole numbers"),
         ("start_cells", {0: None}, r"returned \[None\] as cells"),
         ("start_cells", {0: [3]}, r"returned \[\[3\]\] as cells"),
-        ("parents", None, "returned None as cells; it must return whole numbers"),
-        ("parents", 7, "returned 7 as cells"),
-        ("parents", {3, 4}, r"returned \{3, 4\} as cells"),
-        ("parents", "12", "returned '12' as cells"),
-        ("parents", ["a"], r"returned \['a'\] as cells"),
-        ("parents", [True], r"returned \[True\] as cells"),
-        ("parents", [[1], [2, 3]], r"returned \[\[1\], \[2, 3\]\] as cells"),
-        ("parents", EVERY_CELL, r"names the cells (\d+, ){4}\d+ \.\.\., which have no elite"),
     ],
 )
 def test_centres_and_elites_that_are_not_there_are_an_error_with_a_sentence(function, returned, sentence):
@@ -185,8 +173,8 @@ def test_centres_and_elites_that_are_not_there_are_an_error_with_a_sentence(func
 def test_without_a_map_no_cell_can_be_named():
     config = config_of(generations=1, algorithm="es")
     config = config.model_copy(update={"map": config.map.model_copy(update={"enabled": False})})
-    algorithm = replace(ALGORITHMS["es"](config), parents=lambda state, generation: [0])
-    with pytest.raises(EvaluationError, match=r"`parents` names the cells 0, .*; the run has no map"):
+    algorithm = replace(ALGORITHMS["es"](config), start_cells=lambda state, generation: {0: 0})
+    with pytest.raises(EvaluationError, match=r"`start_cells` names the cells 0, .*; the run has no map"):
         run_in_memory(config, algorithm=algorithm)
 
 
@@ -242,6 +230,5 @@ def test_numbers_of_numpy_name_cells_and_centres_as_those_of_python_do():
         return ours.restart(state, index, cell, elite)
 
     begun = lambda state, generation: {np.int64(1): state.map.cell_N[0]}  # noqa: E731
-    named = lambda state, generation: state.map.cell_N  # noqa: E731
-    run_in_memory(config, algorithm=replace(ours, start_cells=begun, parents=named, restart=restart))
+    run_in_memory(config, algorithm=replace(ours, start_cells=begun, restart=restart))
     assert [type(number) for number in seen[0]] == [int, int]

@@ -3,6 +3,7 @@ generation, through kills, reopened stores, damage of the newest generation, and
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,15 +12,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.loop.changes import changed_parts
-from es_service.loop.parts import state_from_parts
+from es_service.loop.arrays import changes, names_of, state_of, stored
 from es_service.loop.state import Best, RunState
+from es_service.protocol.content import name_of, names
 from es_service.protocol.messages import Moments
 from es_service.search.algorithms.base import SearchState, frozen
 from es_service.search.algorithms.common import first_state
-from es_service.search.maps.behaviour_map import COLUMNS, Elite, changed, empty_map, insert, moved, removed, resampled
+from es_service.search.maps.behaviour_map import (
+    COLUMNS,
+    changed,
+    empty_map,
+    insert,
+    moved,
+    removed,
+    resampled,
+    with_names,
+)
 from es_service.search.novelty import archive_of, extended
-from es_service.search.state_parts import Appended, ByCell, Whole
 from es_service.store.beginning import Beginning
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_evaluations, read_history, read_kept, read_parts
@@ -39,9 +48,13 @@ from tests.es_service.store_examples import (
 GENERATIONS = 7
 
 
-def policy_of(generation, centre) -> Elite:
-    """The policy that an entry of the map has, wherever it is."""
-    return Elite(*(np.float32([generation, centre, part]) for part in range(4)))
+def policy_of(generation, centre):
+    """The policy with which an entry of the map begins. Some generations evaluate the same ones."""
+    return {"parameters_D": np.float32([generation // 2, centre])}
+
+
+POLICIES = {name_of(policy): policy for at in range(GENERATIONS) for policy in [policy_of(at, 0)]}
+"""Every policy by its name."""
 
 
 def some(rng, *shape):
@@ -107,7 +120,7 @@ def elite_changes(state, generation, rng):
     elif way == 3:  # by hand: all columns in another order
         rows = rng.permutation(map_.size)
         columns = ("cell_N", *COLUMNS, *(() if map_.samples_N is None else ("samples_N",)))
-        map_ = replace(map_, **{name: getattr(map_, name)[rows] for name in columns}, order_N=None)
+        map_ = replace(map_, **{name: getattr(map_, name)[rows] for name in columns})
     else:
         map_, _, _ = moved(map_, cell, rng.uniform([0, 0], [6, 2]))
     return replace(state, map=map_)
@@ -127,21 +140,29 @@ def own_values_change(state, generation, rng):
     elif way == 1:
         extra[name] = some(rng, *rng.integers(0, 3, int(rng.integers(3)))).astype(rng.choice(["f4", "f8"]))
     elif way == 2:
-        extra[name] = Whole({str(key): some(rng, 2) for key in range(rng.integers(3))})
-    elif way == 3 or not isinstance(then, Appended | ByCell):
-        rows = int(rng.integers(0, 600))
-        extra[name] = Appended({"x": some(rng, rows, 2), "n": rng.integers(0, 2, rows)}) if way % 2 else ByCell()
-    elif isinstance(then, Appended):
-        kept = then.arrays["x"].shape[0] - int(rng.integers(2)) * int(rng.integers(300))
-        more = int(rng.integers(0, 300))
-        x, n = then.arrays["x"][: max(0, kept)], then.arrays["n"][: max(0, kept)]
-        extra[name] = Appended({"x": np.concatenate([x, some(rng, more, 2)]), "n": np.append(n, np.arange(more))})
+        extra[name] = {str(key): some(rng, 2) for key in range(rng.integers(3))}
+    elif way == 3 or not isinstance(then, Mapping):
+        rows = int(rng.integers(0, 3000))
+        extra[name] = {"x": some(rng, rows, 2), "n": rng.integers(0, 2, rows)} if way % 2 else {}
+    elif "n" in then:
+        kept = then["x"].shape[0] - int(rng.integers(2)) * int(rng.integers(1000))
+        more = int(rng.integers(0, 1000))
+        x, n = then["x"][: max(0, kept)], then["n"][: max(0, kept)]
+        extra[name] = {"x": np.concatenate([x, some(rng, more, 2)]), "n": np.append(n, np.arange(more))}
     else:
-        entries = {cell: entry for cell, entry in then.entries.items() if rng.random() < 0.8}
-        for cell in rng.integers(0, 5, 2):
-            entries[cell] = {"x": some(rng, int(rng.integers(3)))}
-        extra[name] = ByCell(entries)
+        entries = {key: entry for key, entry in then.items() if rng.random() < 0.8}
+        for key in rng.integers(0, 5, 2):
+            entries[f"at {key}"] = {"x": some(rng, int(rng.integers(3)))}
+        extra[name] = entries
     return replace(state, extra=extra)
+
+
+def names_are_remembered(state, generation, rng):
+    """A search keeps names of policies that leave the map, and forgets some."""
+    if not state.map.size:
+        return state
+    kept = state.map.policy_N[rng.random(state.map.size) < 0.3]
+    return replace(state, extra={**state.extra, "hall": kept[kept != np.zeros((), kept.dtype)]})
 
 
 def nothing_changes(state, generation, rng):
@@ -164,20 +185,23 @@ CHANGES = [
     samples_are_counted_or_not,
     own_values_change,
     own_values_change,
+    names_are_remembered,
     nothing_changes,
 ]
 
 
 def run_state(search: SearchState, generation, before: RunState | None) -> RunState:
-    """A state of a run, with the policies of elites that this generation has evaluated."""
-    best = before.best if before is not None and generation % 3 else Best(generation, 1.0, *(np.zeros(2, "f4"),) * 3)
-    elites = {
-        int(cell): policy_of(generation, int(centre))
-        for cell, at, centre in zip(search.map.cell_N, search.map.generation_N, search.map.centre_N, strict=True)
-        if at == generation
-    }
+    """A state of a run, whose entries of this generation have got the names of their policies."""
+
+    def named(rows):
+        found = names(name_of(policy_of(generation, row)) for row in rows)
+        return found, found
+
+    POLICIES.update((name_of(policy), policy) for policy in (policy_of(generation, centre) for centre in range(6)))
+    search = replace(search, map=with_names(search.map, generation, np.arange(6), named))
+    best = before.best if before is not None and generation % 3 else Best(generation, 1.0, named([0])[0][0])
     moments = Moments(float(generation), np.zeros(2), np.ones(2))
-    return RunState(generation, frozen(search), moments, best, generation * 10, generation, 0.0, elites)
+    return RunState(generation, frozen(search), moments, best, generation * 10, generation, 0.0)
 
 
 def every_state(seed, changes):
@@ -185,8 +209,8 @@ def every_state(seed, changes):
     rng = np.random.default_rng(seed)
     search = first_state([np.zeros(3, np.float32)] * 2, 2, 1.0, empty_map(PLANE), {"a": np.arange(3.0)})
     states: list[RunState] = []
-    for generation, names in enumerate(changes):
-        for change in names:
+    for generation, chosen in enumerate(changes):
+        for change in chosen:
             search = change(search, generation, rng)
         states.append(run_state(search, generation, states[-1] if states else None))
         search = states[-1].search
@@ -194,28 +218,25 @@ def every_state(seed, changes):
 
 
 def reference(state: RunState):
-    """All parts of a state."""
-    map_ = state.search.map
-    elites = {
-        int(cell): policy_of(int(generation), int(centre))
-        for cell, generation, centre in zip(map_.cell_N, map_.generation_N, map_.centre_N, strict=True)
-    }
-    parts = changed_parts(replace(state, elites=elites), None)
-    return {
-        name: {key: np.asarray(value) for key, value in part.items()}
-        for name, part in parts.items()
-        if part is not None
-    }
+    """All blocks of a state."""
+    return stored(state)
 
 
 def commit(store, state, before):
-    parts = changed_parts(state, before, store.part)
-    store.commit(state.generation, parts, history_row(state.generation), evaluated_table(state.generation))
+    blocks, row = changes(state, before), history_row(state.generation)
+    store.commit(state.generation, blocks, row, evaluated_table(state.generation), POLICIES)
 
 
 def loaded(folder, generation):
-    """The state of a generation as a session that continues from it has it, without policies."""
-    return state_from_parts(read_parts(folder, generation)[1], generation, 0.0, 2)
+    """The state of a generation as a session that continues from it has it."""
+    return state_of(read_parts(folder, generation)[1], generation, 0.0)
+
+
+def assert_policies_of(folder, states):
+    """The store has the policies that these states name, and no others."""
+    with database(folder / "run.db") as connection:
+        found = {name for (name,) in connection.execute("SELECT name FROM content")}
+    assert found == frozenset().union(*(names_of(stored(state)) for state in states))
 
 
 class Killed(Exception):  # noqa: N818 (no error)
@@ -255,6 +276,7 @@ def test_every_kept_generation_is_the_reference_whatever_happened(tmp_path_facto
         commit(store, state, before)
         before = state
         assert_same_state(store.load(), expected[generation])
+        assert_policies_of(folder, [states[at] for at in read_kept(folder)[1]])
     newest = GENERATIONS - 1
     kept = read_kept(folder)[1]
     assert set(kept) == {newest - 1, newest, *(range(0, newest, keep) if keep else ())}
@@ -266,7 +288,9 @@ def test_every_kept_generation_is_the_reference_whatever_happened(tmp_path_facto
         assert again.notices == []
         assert_same_state(again.load(), expected[-1])
     other = folder.with_name("other")
-    beginning = Beginning(read_history(folder), expected[-1], newest=newest, evaluations=read_evaluations(folder))
+    contents = {name: POLICIES[name] for name in names_of(expected[-1])}
+    evaluations = read_evaluations(folder)
+    beginning = Beginning(read_history(folder), expected[-1], contents, newest=newest, evaluations=evaluations)
     RunStore.create(other, CONFIG_YAML, meta(), beginning).close()
     assert digest_parts(other) == digest_parts(folder), "the digest does not depend on how the state came about"
 
@@ -276,18 +300,14 @@ def test_every_kept_generation_is_the_reference_whatever_happened(tmp_path_facto
 def test_the_same_is_written_after_a_resume_and_what_has_not_changed_is_not(course, seed):
     states = every_state(seed, course)
     for before, state in pairwise(states):
-        resumed = state_from_parts(reference(before), before.generation, 0.0, 2)
-        stored = reference(before).__getitem__
-        straight, after_resume = (changed_parts(state, then, stored) for then in (before, resumed))
+        resumed = state_of(reference(before), before.generation, 0.0)
+        straight, after_resume = (changes(state, then) for then in (before, resumed))
         assert straight.keys() == after_resume.keys()
         then, now = reference(before), reference(state)
         differing = {name for name in now if name not in then or not same(now[name], then[name])}
-        always = {"observations", "counters"}
         assert {name for name, part in straight.items() if part is None} == then.keys() - now.keys()
         written = {name for name, part in straight.items() if part is not None}
-        assert differing <= written
-        # Blocks after the first entry that differs are written, too, and policies that were brought.
-        assert all(name in always or name.startswith(("novelty_", "elite_", "rows_")) for name in written - differing)
+        assert differing == written
 
 
 def same(now, then):

@@ -11,7 +11,7 @@ import pytest
 from es_service.api import load_config
 from es_service.config.workload import chunks_at_once, parallel_sentence
 from es_service.errors import ConfigError
-from es_service.loop.parts import elite_part
+from es_service.protocol.content import names
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.protocol.recipes import IsoLine, variation
@@ -19,7 +19,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.map_elites import PARENT_CHOICE, parent_cells
-from es_service.search.maps.behaviour_map import Elite, empty_map, insert
+from es_service.search.maps.behaviour_map import empty_map, insert
 from es_service.search.maps.geometry import Grid
 from tests.laws.me_es_runs import CELLS, SHAPE, first_centres, number, run_in_memory
 from tests.references import map_elites as reference
@@ -98,7 +98,7 @@ def test_twelve_generations_equal_the_reference():
     assert map_.centre_N.tolist() == [one.emitter for one in elites.values()]
     np.testing.assert_allclose(map_.fitness_N, [one.fitness for one in elites.values()], rtol=1e-6)
     for index, one in elites.items():
-        np.testing.assert_array_equal(store.part(elite_part(number(index)))["centre_D"], one.centre)
+        np.testing.assert_array_equal(store.elite(number(index)).centre_D, one.centre)
     assert len(elites) > 20
     assert len(seen) > 100
     assert any(x == y for x, y in seen)
@@ -108,12 +108,18 @@ def test_twelve_generations_equal_the_reference():
 # Parents and their children
 
 
+def cell_name(cell):
+    """Name of the policy in a cell."""
+    return bytes([1, cell] * 16)
+
+
 def elites_in(cells):
     """A state whose map has elites in some of a hundred cells in a row."""
     map_ = empty_map(Grid(((0.0, 100.0),), (100,)))
     for cell in cells:
         map_, _, entered = insert(map_, np.array([cell + 0.5]), 0.0, 0, cell, np.nan)
         assert entered
+    map_ = replace(map_, policy_N=names(map(cell_name, cells)))
     return first_state([np.zeros(3, np.float32), np.ones(3, np.float32)], 1, 1.0, map_)
 
 
@@ -125,28 +131,21 @@ def test_both_parents_are_drawn_from_all_filled_cells_with_equal_probability():
     assert sum(found) == pytest.approx(1.0)
     np.testing.assert_allclose(found, 1 / 16, atol=4 * np.sqrt(1 / 16 / 4000))
     assert (parent_cells(config, elites_in(cells), 2) != drawn_N_2).any()
-    assert ALGORITHMS["map_elites"](config).parents(elites_in(cells), 1) == sorted(cells)
 
 
-def test_only_the_elites_of_the_parents_are_needed():
-    config, state = config_of(batch=2), elites_in(range(100))
-    search = ALGORITHMS["map_elites"](config)
-    needed = search.parents(state, 1)
-    assert needed == sorted(set(parent_cells(config, state, 1).ravel().tolist()))
-    assert 1 <= len(needed) <= 4
-    nothing = np.zeros(0, np.float32)
-    elites = {cell: Elite(np.full(3, cell, np.float32), nothing, nothing, nothing) for cell in needed}
-    (asked,) = search.ask(replace(state, elites=elites), 1)
-    made_N_D = asked.parameters_N_D.made()
-    assert made_N_D.shape == (2, 3)
-    assert made_N_D.dtype == np.float32
-    assert len(asked.parameters_N_D.parents) == len(needed)
+def test_parents_are_named_each_once_as_the_elites_of_their_cells():
+    config, state = config_of(batch=2), elites_in([70, 3, 50, 51])
+    (asked,) = ALGORITHMS["map_elites"](config).ask(state, 1)
+    recipes, cell_N_2 = asked.parameters_N_D, parent_cells(config, state, 1)
+    assert len(recipes.names) == len(set(recipes.names)) == len(np.unique(cell_N_2)) <= 4
+    assert recipes.parents == ()
+    named = [[recipes.names[parent] for parent in both] for both in recipes.parent_N_2.tolist()]
+    assert named == [[cell_name(cell) for cell in both] for both in cell_N_2.tolist()]
 
 
 def test_while_the_map_is_empty_the_parents_are_the_centres():
     """As in a fork whose evaluations mean something else."""
     search = ALGORITHMS["map_elites"](config_of(batch=64, iso_sigma=0.0, line_sigma=0.0))
-    assert search.parents(elites_in([]), 1) == []
     (asked,) = search.ask(elites_in([]), 1)
     assert {tuple(row) for row in asked.parameters_N_D.made().tolist()} == {(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)}
 

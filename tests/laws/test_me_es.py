@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
+from es_service.loop.arrays import value_of
 from es_service.loop.history import history_columns
-from es_service.loop.parts import cell_part, elite_part, map_from_parts, moments_from_arrays
-from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk
+from es_service.protocol.content import as_bytes
+from es_service.protocol.messages import EvaluationChunk, GradientChunk, Moments, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import NO_CELL
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.observation_statistics import normalisation
 from es_service.store.codec import decode_part, encode_part
+from tests.helpers import map_of
 from tests.laws.me_es_runs import (
     BLOCK,
     CELLS,
@@ -65,15 +67,14 @@ def test_thirty_generations_equal_the_reference(preset, mode):
         assert row["coverage"] == row["coverage_reachable"] == coverage(elites, 300)
         assert row["map_fitness_max"] == pytest.approx(max(elite.fitness for elite in elites.values()), rel=1e-12)
         assert row["qd_score"] == pytest.approx(qd_score(elites, -2.3431 * 200), rel=1e-12)
-        map_ = map_from_parts(store.after[generation])
-        assert map_ is not None
+        map_ = map_of(store.after[generation])
         assert map_.cell_N.tolist() == [number(index) for index in elites]
         assert map_.generation_N.tolist() == [elite.generation for elite in elites.values()]
         for name in ("fitness", "score", "descriptor"):
             ours = map_.descriptor_N_B if name == "descriptor" else getattr(map_, f"{name}_N")
             np.testing.assert_allclose(ours, [getattr(elite, name) for elite in elites.values()], rtol=1e-12)
     for index, elite in elites.items():
-        assert_near(store.part(elite_part(number(index)))["centre_D"], elite.centre)
+        assert_near(store.elite(number(index)).centre_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
     entered = [row["cell"] for row in store.rows if row["cell"] is not None]
     assert 31 > len(entered) > len(elites) >= 8  # some entered no cell, some one that had an elite
@@ -86,7 +87,7 @@ def test_thirty_generations_equal_the_reference(preset, mode):
 
 def test_a_block_has_a_fresh_optimiser_and_keeps_it():
     _, store, _ = run_in_memory(config_of(generations=12))
-    assert [int(parts["centre_0"]["adam_step"]) for parts in store.after] == [0] + [1, 2, 3] * 4
+    assert [int(parts["centres/0/step"]["adam_step"]) for parts in store.after] == [0] + [1, 2, 3] * 4
 
 
 def test_a_block_starts_from_its_elite_and_goes_on_from_wherever_it_comes():
@@ -95,7 +96,7 @@ def test_a_block_starts_from_its_elite_and_goes_on_from_wherever_it_comes():
         row, before = store.rows[generation], store.after[generation - 1]
         start = points(evaluator, TrainingChunk, generation)[0].parameters_D
         if generation % BLOCK == 1:
-            np.testing.assert_array_equal(start, before[elite_part(row["start_cell"])]["centre_D"])
+            np.testing.assert_array_equal(start, store.elite(row["start_cell"], before).centre_D)
         else:
             assert row["start_cell"] is None
             np.testing.assert_array_equal(start, points(evaluator, EvaluationChunk, generation - 1)[0].parameters_D)
@@ -107,15 +108,18 @@ def test_the_history_names_each_elite_that_entered_and_the_store_has_it():
     _, store, evaluator = run_in_memory(config_of())
     before = {}
     for row, parts in zip(store.rows, store.after, strict=True):
-        written = [name for name, part in parts.items() if name.startswith("elite_") and part is not before.get(name)]
-        assert written == ([] if row["cell"] is None else [elite_part(row["cell"])])
+        map_ = map_of(parts)
+        named = dict(zip(map_.cell_N.tolist(), as_bytes(map_.policy_N), strict=True))
+        entered = [cell for cell in named if named[cell] != before.get(cell)]
+        assert entered == ([] if row["cell"] is None else [row["cell"]])
         point = points(evaluator, EvaluationChunk, row["generation"])[0]
-        for name in written:
-            np.testing.assert_array_equal(parts[name]["centre_D"], point.parameters_D)
-            np.testing.assert_array_equal(parts[name]["observation_mean_O"], point.observation_mean_O)
-            np.testing.assert_array_equal(parts[name]["observation_std_O"], point.observation_std_O)
-            assert parts[name]["trace_T_B"].shape == (64, 2)
-        before = parts
+        for cell in entered:
+            elite = store.elite(cell, parts)
+            np.testing.assert_array_equal(elite.centre_D, point.parameters_D)
+            np.testing.assert_array_equal(elite.observation_mean_O, point.observation_mean_O)
+            np.testing.assert_array_equal(elite.observation_std_O, point.observation_std_O)
+            assert elite.trace_T_B.shape == (64, 2)
+        before = named
 
 
 def modes(count, **search):
@@ -159,11 +163,11 @@ def test_an_invalid_centre_enters_neither_archive_nor_map_and_the_search_goes_on
         row, before = store.rows[generation], store.rows[generation - 1]
         assert row["centre_novelty"] is None
         assert row["cell"] is None
-        assert store.after[generation]["centre_0"]["cell"] == NO_CELL
+        assert store.after[generation]["centres/0"]["cell"] == NO_CELL
         for name in (*names[:-1], "best_fitness"):
             assert row[name] == before[name]
-    led = store.after[7][cell_part(store.rows[7]["start_cell"])]
-    assert led["score"] == store.rows[7]["population_fitness_max"]
+    map_ = map_of(store.after[7])
+    assert map_.score_N[map_.row_of(store.rows[7]["start_cell"])] == store.rows[7]["population_fitness_max"]
     for generation in (6, 8):
         start = points(evaluator, TrainingChunk, generation)[0].parameters_D
         np.testing.assert_array_equal(start, points(evaluator, EvaluationChunk, generation - 1)[0].parameters_D)
@@ -188,18 +192,18 @@ def statistics_of(evaluator, generation):
 
 
 def of_the_run(parts):
-    return tuple(x.tobytes() for x in normalisation(moments_from_arrays(parts["observations"]), True))
+    return tuple(x.tobytes() for x in normalisation(value_of(Moments, parts, "observations"), True))
 
 
-def of_the_elite(part):
-    return part["observation_mean_O"].tobytes(), part["observation_std_O"].tobytes()
+def of_the_elite(elite):
+    return elite.observation_mean_O.tobytes(), elite.observation_std_O.tobytes()
 
 
 def test_a_block_can_run_with_its_elite_s_statistics():
     state, store, evaluator = run_in_memory(config_of(parent_statistics="elite"))
     differ = 0
     for first in range(1, 31, BLOCK):
-        elite = of_the_elite(store.after[first - 1][elite_part(store.rows[first]["start_cell"])])
+        elite = of_the_elite(store.elite(store.rows[first]["start_cell"], store.after[first - 1]))
         for generation in range(first, first + BLOCK):
             assert statistics_of(evaluator, generation) == elite
             differ += elite != of_the_run(store.after[generation - 1])
@@ -212,7 +216,7 @@ def test_a_block_can_run_with_the_run_s_statistics():
     _, store, evaluator = run_in_memory(config_of(parent_statistics="global"))
     for generation in range(1, 31):
         assert statistics_of(evaluator, generation) == of_the_run(store.after[generation - 1])
-        assert "own_mean_O" not in store.after[generation]["centre_0"]
+        assert "own_mean_O" not in store.after[generation]["centres/0"]
 
 
 # Interruption
@@ -222,8 +226,8 @@ def test_a_block_can_run_with_the_run_s_statistics():
 def test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one(preset):
     _, straight, _ = run_in_memory(config_of(preset, generations=12))
     _, store, _ = run_in_memory(config_of(preset, generations=7))
-    assert store.parts["centre_0"]["adam_step"] == 1
-    assert ("own_mean_O" in store.parts["centre_0"]) == (preset == "literature")
+    assert store.parts["centres/0/step"]["adam_step"] == 1
+    assert ("own_mean_O" in store.parts["centres/0"]) == (preset == "literature")
     store.parts = {name: decode_part(encode_part(part)) for name, part in store.parts.items()}
     run_in_memory(config_of(preset, generations=12), store=store)
     assert store.parts.keys() == straight.parts.keys()

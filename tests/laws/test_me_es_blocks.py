@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from es_service.protocol.content import NAME
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
 from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map
@@ -26,6 +27,7 @@ def line(descriptors, fitness=None, generations=None, scores=None):
         np.array(generations or range(count), np.int64),
         np.zeros(count, np.int64),
         np.array(scores or [0.0] * count, np.float64),
+        *np.zeros((2, count), NAME),
     )
 
 

@@ -9,7 +9,8 @@ import pytest
 from es_service import api
 from es_service.api import load_config
 from es_service.errors import ConfigError
-from es_service.loop.parts import elite_part
+from es_service.loop.arrays import joined
+from es_service.protocol.content import as_bytes
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
@@ -19,12 +20,12 @@ from es_service.search.algorithms.measured import (
     KEPT,
     LAYER_CHOICE,
     PLACE_CHOICE,
-    POLICIES,
     SAMPLES,
     kept_of,
     shares,
 )
-from es_service.search.state_parts import ByCell, Whole
+from es_service.search.maps.behaviour_map import empty_map
+from tests.helpers import map_of
 from tests.laws.me_es_runs import CELLS, SHAPE, Sharing, first_centres, run_in_memory
 from tests.laws.me_es_runs import config_of as config_of_centres
 from tests.laws.test_map_elites import ISO, LINE
@@ -124,21 +125,18 @@ def test_map_elites_equals_the_reference(name):
         before = {one.serial: one.cell for one in measured}
         other.told(told, children, drawn(generation, PLACE_CHOICE, kept))
         moved += sum(one.cell != before[one.serial] for one in measured)
-        map_, parts = store.after[generation]["map"], store.after[generation]
-        assert "counts_samples" in map_
-        arrays = parts["whole_kept"]
+        parts = store.after[generation]
+        map_, arrays = map_of(parts), joined(parts)["extra/kept"]
         assert arrays["serial_K"].tolist() == [one.serial for one in other.all()]
         assert arrays["cell_K"].tolist() == [one.cell for one in other.all()]
         assert arrays["samples_K"].tolist() == [len(one.samples) for one in other.all()]
         np.testing.assert_allclose(arrays["fitness_K"], [other.fitness(one) for one in other.all()], rtol=1e-12)
-        cells = sorted((int(part["order"]), name) for name, part in parts.items() if name.startswith("cell_"))
-        assert [int(name.removeprefix("cell_")) for _, name in cells] == other.filled
-        for cell in other.filled:
-            top, entry = other.cells[cell][0], parts[f"cell_{cell:08d}"]
-            assert (int(entry["generation"]), int(entry["centre"])) == (top.generation, top.number)
-            assert int(entry["samples"]) == len(top.samples)
-            np.testing.assert_array_equal(parts[elite_part(cell)]["centre_D"], top.parameters)
-        assert sum(name.startswith("elite_") for name in parts) == len(other.filled)
+        assert map_.cell_N.tolist() == other.filled
+        for row, cell in enumerate(other.filled):
+            top = other.cells[cell][0]
+            assert (map_.generation_N[row], map_.centre_N[row]) == (top.generation, top.number)
+            assert map_.samples_N[row] == len(top.samples)
+            np.testing.assert_array_equal(store.elite(cell, parts).centre_D, top.parameters)
     assert spoiled
     assert moved or not elites.again
     deepest = max(len(ranked) for ranked in other.cells.values())
@@ -176,7 +174,7 @@ def test_the_maps_of_emitters_equal_the_reference(algorithm, kind):
         again = (kept if kind == "archive_sampling" else wanted) if generation else 0
         measured = other.drawn(again, drawn(generation, AGAIN_CHOICE, kept))
         assert [row["centre"] for row in rows] == list(range(emitters + len(measured)))
-        centres = [parts[f"centre_{index}"] for index in range(emitters)]
+        centres = [parts[f"centres/{index}"] for index in range(emitters)]
         new = [
             Policy(0, generation, index, centre["centre_D"].tolist(), [samples[index]])
             for index, centre in enumerate(centres)
@@ -188,15 +186,16 @@ def test_the_maps_of_emitters_equal_the_reference(algorithm, kind):
         other.told([(policy, *sample, True) for policy, sample in told], new)
         moved += sum(one.cell != before[one.serial] for one in measured)
         restarted += sum(row["start_cell"] is not None for row in rows)
-        arrays = parts["whole_kept"]
+        arrays = joined(parts)["extra/kept"]
         assert arrays["serial_K"].tolist() == [one.serial for one in other.all()]
         np.testing.assert_allclose(arrays["fitness_K"], [other.fitness(one) for one in other.all()], rtol=1e-12)
         tops = {cell: ranked[0] for cell, ranked in other.cells.items()}
-        assert {int(name.removeprefix("cell_")) for name in parts if name.startswith("cell_")} == tops.keys()
+        map_, names = map_of(parts), dict(zip(arrays["serial_K"].tolist(), as_bytes(arrays["policy_K"]), strict=True))
+        assert dict(zip(map_.cell_N.tolist(), as_bytes(map_.policy_N), strict=True)) == {
+            cell: names[top.serial] for cell, top in tops.items()
+        }
         for cell, top in tops.items():
-            assert parts[elite_part(cell)]["centre_D"].tolist() == top.parameters
-            statistics = parts[f"cells_policies/{top.serial:08d}"]["observation_mean_O"]
-            np.testing.assert_array_equal(parts[elite_part(cell)]["observation_mean_O"], statistics)
+            assert store.elite(cell, parts).centre_D.tolist() == top.parameters
         for index, centre in enumerate(centres):
             mine = [cell for cell, top in tops.items() if (top.generation, top.number) == (generation, index)]
             assert centre["cell"] == (mine[0] if mine else -1)
@@ -209,9 +208,9 @@ def test_a_population_around_an_elite_gives_it_its_score():
     _, store, _ = run_in_memory(config)
     scored = 0
     for before, after in pairwise(store.after):
-        then, now = before["whole_kept"], after["whole_kept"]
+        then, now = joined(before)["extra/kept"], joined(after)["extra/kept"]
         for index in range(config.search.emitters):
-            cell = int(before[f"centre_{index}"]["cell"])
+            cell = int(before[f"centres/{index}"]["cell"])
             if cell < 0:
                 continue
             row = then["cell_K"].tolist().index(cell)  # the first of the cell is its elite
@@ -227,10 +226,7 @@ def test_a_population_around_an_elite_gives_it_its_score():
 def test_after_a_fork_that_emptied_the_map_nothing_is_kept():
     config = config_of("eme")
     state, _, _ = run_in_memory(config)
-    emptied = replace(state.search, map=replace(state.search.map, **{
-        name: getattr(state.search.map, name)[:0]
-        for name in ("cell_N", "fitness_N", "descriptor_N_B", "generation_N", "centre_N", "score_N", "samples_N")
-    }, order_N=None))  # fmt: skip
+    emptied = replace(state.search, map=empty_map(state.search.map.geometry, counts_samples=True))
     assert kept_of(emptied).size == 0
     asked = ALGORITHMS["map_elites"](config).ask(emptied, GENERATIONS + 1)
     assert len(asked) == 1
@@ -241,8 +237,7 @@ def test_after_a_fork_that_emptied_the_map_nothing_is_kept():
 def test_only_what_is_measured_again_counts_samples_and_keeps_policies():
     for name, elites in {"once": {"kind": "once"}, "eme": {"kind": "eme", "estimate": "median"}}.items():
         state, _, _ = run_in_memory(config_of("eme", generations=2, elites=elites))
-        extra = {KEPT: Whole, POLICIES: ByCell, SAMPLES: ByCell} if name == "eme" else {}
-        assert {key: type(value) for key, value in state.search.extra.items()} == extra
+        assert state.search.extra.keys() == ({KEPT, SAMPLES} if name == "eme" else set())
         assert (state.search.map.samples_N is None) == (name == "once")
 
 
@@ -327,10 +322,10 @@ def test_without_noise_the_corrected_values_are_the_stored_ones(tmp_path, name):
 @pytest.mark.usefixtures("workers_here")
 def test_a_fork_may_change_the_container_but_not_what_it_is(tmp_path):
     run = run_of(tmp_path, generations=4, correct=None)
-    assert run.parts()[1]["whole_kept"]["serial_K"].size > len(run.map)
+    assert run.at().nodes["extra/kept"]["serial_K"].size > len(run.map)
     further = ["budget.generations=6"]
     flat = api.fork(run.folder, [*further, "search.elites.depth=1"], out=tmp_path / "flat").run
-    assert flat.parts()[1]["whole_kept"]["serial_K"].size == len(flat.map)
+    assert flat.at().nodes["extra/kept"]["serial_K"].size == len(flat.map)
     for change in ("kind=once", "estimate=median"):
         with pytest.raises(ConfigError, match=r"its state does not fit these changes:\n  search\.elites\."):
             api.fork(run.folder, [*further, f"search.elites.{change}"], out=tmp_path / "other")

@@ -12,8 +12,8 @@ import pytest
 from es_service.api import load_config
 from es_service.config.workload import parallel_sentence
 from es_service.errors import ConfigError
+from es_service.loop.arrays import EXTRA, joined
 from es_service.loop.history import history_columns
-from es_service.loop.parts import elite_part
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
@@ -24,7 +24,6 @@ from es_service.search.algorithms.starts import TRIED, Starts, drawn_cell, start
 from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.search.novelty import empty_archive, extended
-from es_service.search.state_parts import OWN
 from es_service.store.codec import decode_part, encode_part
 from tests.laws import me_es_runs
 from tests.laws.me_es_runs import (
@@ -86,11 +85,11 @@ def test_twenty_four_generations_equal_the_reference(mode):
         for row, (_, place) in zip(rows, told, strict=True):
             assert row["novelty"] == pytest.approx(other.novelty(place), rel=1e-12)
         assert [row["cell"] for row in rows] == [number(cell) for cell in other.end(generation, told)]
-        assert store.after[generation][OWN][STAGNANT].tolist() == other.useless
+        assert joined(store.after[generation])[EXTRA][STAGNANT].tolist() == other.useless
     map_ = state.search.map
     assert map_.cell_N.tolist() == [number(index) for index in elites]
     for index, elite in elites.items():
-        assert_near(store.part(elite_part(number(index)))["centre_D"], elite.centre)
+        assert_near(store.elite(number(index)).centre_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
     assert state.search.archive.size == 25 * EMITTERS > NEWEST, "the archive itself stays whole"
     assert len(resets) >= 5
@@ -176,7 +175,7 @@ def test_while_the_map_is_empty_no_emitter_is_reset():
 def test_a_search_put_together_again_equals_an_uninterrupted_one():
     """Stopped where emitters have been reset already, and others are about to be."""
     _, straight, _ = run_in_memory(config_of(generations=16))
-    stop = next(at for at, parts in enumerate(straight.after) if at > 5 and (parts[OWN][STAGNANT] == 1).any())
+    stop = next(at for at, parts in enumerate(straight.after) if at > 5 and (joined(parts)[EXTRA][STAGNANT] == 1).any())
     _, store, _ = run_in_memory(config_of(generations=stop))
     store.parts = {name: decode_part(encode_part(part)) for name, part in store.parts.items()}
     run_in_memory(config_of(generations=16), Sharing(), store)

@@ -15,10 +15,10 @@ from es_service.config.tasks import TASKS
 from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import history_columns
+from es_service.protocol.content import name_of
 from es_service.search import algorithms
 from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.search.observation_statistics import no_observations
-from es_service.store.digest import arrays_sha256
 from tests.es_service.config_examples import load_config
 from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering
@@ -203,7 +203,7 @@ def digest(config):
     total = hashlib.sha256()
     for parts in store.after:
         for name in sorted(parts):
-            total.update(f"{name} {arrays_sha256(parts[name])}\n".encode())
+            total.update(f"{name} {name_of(parts[name]).hex()}\n".encode())
     columns = [one.name for one in history_columns(TASK, config.map.enabled, True) if one.deterministic]
     for row, evaluated in zip(store.rows, store.evaluated, strict=True):
         total.update(repr([row.get(column) for column in columns]).encode())

@@ -6,8 +6,8 @@ import pytest
 from es_service.api import load_config
 from es_service.config.parts import Ranks, Returns
 from es_service.config.workload import worker_spec
+from es_service.loop.arrays import state_of
 from es_service.loop.checks import invalidate
-from es_service.loop.parts import state_from_parts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
@@ -127,14 +127,15 @@ def test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_wri
     config = config_of("nsra_es")
 
     class Recording(MemoryStore):
-        def commit(self, generation, parts, history, evaluations):
-            super().commit(generation, parts, history, evaluations)
-            centres = {name for name in parts if name.startswith("centre_")}
+        def commit(self, generation, parts, history, evaluations, contents):
+            super().commit(generation, parts, history, evaluations, contents)
+            centres = {name for name in parts if name.startswith("centres/")}
             wanted = range(5) if generation == 0 else [history["centre"]]
-            assert centres == {f"centre_{centre}" for centre in wanted}
+            steps = [f"centres/{centre}/step" for centre in wanted]
+            assert centres == {*steps, *(f"centres/{centre}" for centre in wanted)}
 
     state, store, _ = run_in_memory(config, store=Recording())
-    again = state_from_parts(store.load(), 20, state.wall_clock_s, 2)
+    again = state_of(store.load(), 20, state.wall_clock_s)
     assert again.search.weight == state.search.weight
     for name in ("descriptor_N_B", "generation_N", "centre_N"):
         np.testing.assert_array_equal(getattr(again.search.archive, name), getattr(state.search.archive, name))

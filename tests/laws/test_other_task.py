@@ -30,7 +30,6 @@ from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
-from es_service.store.schema import get_meta, put_meta
 from es_service.watch.metrics import metrics
 from es_service.watch.pages import draw_list
 from es_service.watch.runs import Runs
@@ -234,18 +233,6 @@ def test_verify_names_what_differs_or_cannot_be_run_in_the_other_task(of_python,
     assert "equal, but the episodes in point_maze cannot be run again: the package is missing" in result.stdout
     monkeypatch.setattr(verification, "stored_task", stored)
     assert CliRunner().invoke(app, ["verify", str(copied.folder)]).exit_code == 0
-
-
-def test_a_run_of_an_older_schema_is_certified_and_then_newer_than_that(copied):
-    certify_run(copied.folder, top=0, episodes=16)
-    with database(copied.folder / "run.db") as connection:
-        put_meta(connection, "schema_version", "7")
-    assert len(open_run(copied.folder).certified) == 1
-    certify_run(copied.folder, top=0, episodes=16, **CORNER)
-    with database(copied.folder / "run.db") as connection:
-        assert get_meta(connection, "schema_version") == "8"
-    table = open_run(copied.folder).certified
-    assert table["elsewhere"].isna().tolist() == [True, False]
 
 
 @pytest.mark.parametrize("change", ["no episodes there", "episodes of no task", "another count"])

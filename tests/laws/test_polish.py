@@ -16,7 +16,6 @@ from es_service.runs.polishing import certified_for, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
-from tests.database import as_0_23_wrote_it
 from tests.laws.test_objectives import results_of
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -45,8 +44,8 @@ def config_of(parent, generations=1, task=TASK, **search):
 def policies_of(run, count):
     """Parameters, mean and standard deviation of the initial centres."""
     names = ("centre_D", "own_mean_O", "own_std_O")
-    parts = run.parts(0)[1]
-    return [tuple(parts[f"centre_{index}"][name] for name in names) for index in range(count)]
+    parts = run.at(0).nodes
+    return [tuple(parts[f"centres/{index}"][name] for name in names) for index in range(count)]
 
 
 def test_it_starts_from_the_best_centre_and_the_fittest_elites_each_with_its_own_statistics(parent, tmp_path):
@@ -116,7 +115,10 @@ def test_candidates_leave_by_mean_ranks_after_the_first_evaluation_and_after_eac
 
 def test_fewer_elites_than_screened_are_all_taken(parent, tmp_path):
     run = api.run(config_of(parent, 1, screened=99, candidates=2), tmp_path / "run").run
-    assert len([name for name in run.parts(0)[1] if name.startswith("centre_")]) <= len(parent.map) + 1
+    assert (
+        len([name for name in run.at(0).nodes if name.startswith("centres/") and name.count("/") == 1])
+        <= len(parent.map) + 1
+    )
     assert run.evaluations.query("generation == 1").shape[0] == 2
 
 
@@ -171,14 +173,11 @@ def test_the_budget_is_the_other_run_s_steps_unless_a_limit_is_given(parent):
 
 
 def test_values_that_decided_that_a_run_is_over_are_not_compared(tmp_path):
-    """Of a parent that ended by `target_certified`, the further episodes are; where there are none, it is certified."""
+    """Of a parent that ended by `target_certified`, the further episodes are."""
     run = api.run(api.load_config(PARENT, ["budget.target_certified=-1000"]), tmp_path / "run").run
     config = polish_config(run.folder)
     [reported] = certified_for(run, config, pytest.fail, workers=1)
     assert (reported.number, reported.decides, reported.tries) == (1, False, 1)
-    as_0_23_wrote_it(run.folder)
-    [again] = certified_for(run, config, pytest.fail, workers=1)
-    assert (again.number, again.decides, again.tries) == (1, False, 0)
 
 
 def test_a_polish_that_a_target_ends_says_how_often_it_was_tried(parent, tmp_path):

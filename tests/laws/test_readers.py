@@ -116,7 +116,7 @@ def test_every_policy_is_the_one_that_was_evaluated(run):
     if updates_centres(run):
         rows = run.evaluations.query("generation == @GENERATIONS and centre < @run.constants['search.centres']")
         fittest = int(rows.loc[rows["fitness_mean"].idxmax(), "centre"])
-        centre_D = run.parts()[1][f"centre_{fittest}"]["centre_D"]
+        centre_D = run.at().nodes[f"centres/{fittest}"]["centre_D"]
         np.testing.assert_array_equal(run.policy("centre").parameters_D, centre_D)
     else:
         with pytest.raises(NotInRunError, match="has no newest centre: its generation 3 evaluated only policies"):

@@ -212,6 +212,13 @@ def test_what_a_sender_does_not_know_of_is_forgotten_first():
         assert set(worker.known) <= set(worker.kept)
 
 
+def born(work, number):
+    """One of the policies that are asked for, whose origin is then known."""
+    parameters_D = work.policies([number])[0].parameters_D
+    remember(work.parameters_N_D.part([number]), [name_of(parameters_D)])
+    return parameters_D
+
+
 def descendants(generations: int, size: int, policies: int = 32):
     """Work of generations in which a few policies of each take the places of parents, as elites do."""
     rng = np.random.default_rng(size)
@@ -221,7 +228,7 @@ def descendants(generations: int, size: int, policies: int = 32):
         work = policy_work(asked, no_statistics(policies, 2), 1, seed=0, generation=generation)
         yield work.work
         for number in rng.integers(policies, size=2).tolist():
-            parents[rng.integers(len(parents))] = work.policies([number])[0].parameters_D
+            parents[rng.integers(len(parents))] = born(work, number)
 
 
 @pytest.mark.parametrize("most", [1, 15, 1000])
@@ -249,7 +256,7 @@ def test_parents_that_a_worker_lacks_are_made_after_what_they_are_made_of():
         work = policy_work(asked, no_statistics(4, 2), 1, seed=0, generation=generation)
         if generation != 1:
             assert made(worker.item(work.work)) == made(work.work)
-        parents = [work.policies([number])[0].parameters_D for number in range(2)]
+        parents = [born(work, number) for number in range(2)]
     assert [isinstance(given, Origin) for given in worker.received] == [False] * 2 + [True] * 4
 
 
@@ -263,7 +270,7 @@ def test_a_small_parent_travels_itself():
 def test_a_policy_has_the_origin_of_which_it_was_made():
     asked = recipes(5, 77)
     assert origin_of(name_of(asked.made()[3])) is None
-    remember(asked, asked.made())
+    remember(asked, [*map(name_of, asked.made())])
     origin = origin_of(name_of(asked.made()[3]))
     assert isinstance(origin, Origin)
     known = dict(zip(asked.names, asked.parents, strict=True))
@@ -274,7 +281,7 @@ def test_threads_that_remember_at_once_keep_the_newest_origins(monkeypatch):
     """As two runs of one process do: each forgets the oldest entries, which another may have forgotten just now."""
     monkeypatch.setattr("es_service.protocol.recipes.MOST_ORIGINS", 20)
     asked = [recipes(100, seed) for seed in range(8)]
-    made = [one.made() for one in asked]
+    made = [[*map(name_of, one.made())] for one in asked]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
@@ -284,7 +291,7 @@ def test_threads_that_remember_at_once_keep_the_newest_origins(monkeypatch):
     finally:
         sys.setswitchinterval(interval)
     remember(asked[0], made[0])
-    assert [origin_of(name_of(policy_D)) is not None for policy_D in made[0]] == [False] * 80 + [True] * 20
+    assert [origin_of(name) is not None for name in made[0]] == [False] * 80 + [True] * 20
 
 
 def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
@@ -294,7 +301,7 @@ def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
     made_N_D = recipes.made()
     np.testing.assert_array_equal(made_N_D, policies)
     assert recipes.names == tuple(map(name_of, made_N_D))
-    remember(recipes, list(made_N_D))
+    remember(recipes, recipes.names)
     assert all(origin_of(name) is None for name in recipes.names)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from es_service.loop.generation import fittest
-from es_service.loop.parts import elite_part, map_from_parts
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation, in_columns
 from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map, novelty_of_centres
@@ -14,6 +13,7 @@ from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.algorithms.nsra_es import adapted_weight
 from es_service.search.maps.behaviour_map import empty_map
 from es_service.search.maps.geometry import Grid
+from tests.helpers import map_of
 from tests.laws.me_es_runs import (
     BLOCK,
     PRESETS,
@@ -76,15 +76,14 @@ def test_blocks_side_by_side_equal_the_reference(preset):
             assert rows[ask]["novelty"] == pytest.approx(found, rel=1e-12)
         mine = [[cell for cell, elite in elites.items() if elite is one.elite] for one in emitters]
         assert [row["cell"] for row in rows] == [number(cells[0], CELLS) if cells else None for cells in mine]
-        map_ = map_from_parts(store.after[generation])
-        assert map_ is not None
+        map_ = map_of(store.after[generation])
         assert map_.cell_N.tolist() == [number(index, CELLS) for index in elites]
         for ours, name in ((map_.generation_N, "generation"), (map_.centre_N, "emitter")):
             assert ours.tolist() == [getattr(elite, name) for elite in elites.values()]
         for ours, name in ((map_.fitness_N, "fitness"), (map_.score_N, "score"), (map_.descriptor_N_B, "descriptor")):
             np.testing.assert_allclose(ours, [getattr(elite, name) for elite in elites.values()], rtol=1e-12)
     for index, elite in elites.items():
-        assert_near(store.part(elite_part(number(index, CELLS)))["centre_D"], elite.centre)
+        assert_near(store.elite(number(index, CELLS)).centre_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, archive, rtol=1e-12)
     assert shared >= 1, "some blocks began from the same elite"
     assert robbed >= 1, "an elite was replaced while a block that led from it was to be told"

@@ -8,7 +8,7 @@ import pytest
 from es_service.errors import EvaluationError
 from es_service.loop import driver
 from es_service.loop.clock import Clock
-from es_service.loop.elites import Elites
+from es_service.loop.contents import Contents
 from es_service.loop.generation import initial_state
 from es_service.loop.interfaces import Stop
 from es_service.protocol.evaluator import completed
@@ -45,9 +45,9 @@ class Noting(Remembering):
         super().__init__()
         self.notes = notes
 
-    def commit(self, generation, parts, history, evaluations):
+    def commit(self, generation, parts, history, evaluations, contents):
         self.notes.append(("stored", generation))
-        super().commit(generation, parts, history, evaluations)
+        super().commit(generation, parts, history, evaluations, contents)
 
 
 def search_of(ask=lambda asked, generation: asked):
@@ -93,7 +93,7 @@ def test_a_list_of_results_drives_a_generation():
         return results_of[-1]
 
     def bits(evaluate):
-        requests = driver.generation(search, Elites({}.get), {}.get, Clock(0.0), initial_state(search))
+        requests = driver.generation(search, Contents({}.get), Clock(0.0), initial_state(search))
         parts = completed(requests, evaluate).parts
         return {name: {key: array.tobytes() for key, array in (part or {}).items()} for name, part in parts.items()}
 

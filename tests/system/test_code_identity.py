@@ -180,7 +180,7 @@ def test_a_search_that_is_edited_between_two_runs_of_one_process_is_new_in_the_s
         (folder / name).write_text(files[name].replace(old, new))
         runs.append(api.run(loaded, f"after_{name}").run)
         assert hashes(runs[-1])[name] == sha256((folder / name).read_bytes()) != hashes(runs[-2])[name]
-    assert [run.parts()[1]["own"]["version"].item() for run in runs] == [1, 2, 3]
+    assert [run.at().nodes["extra"]["version"].item() for run in runs] == [1, 2, 3]
 
     (folder / "my_version.py").write_text("VERSION = 7\n")
     notices = []

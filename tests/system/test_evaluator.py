@@ -192,8 +192,8 @@ def test_initial_policies_are_those_of_a_run(tmp_path):
     """Generation 1 updates centre 0 alone."""
     choice = {"search.algorithm": "nsr_es", "search.centres": 2, "search.centre_choice": "round_robin"}
     config = api.load_config(CONFIG, choice)
-    parts = api.run(config, tmp_path / "run").run.parts()[1]
-    centres = [parts[f"centre_{centre}"]["centre_D"] for centre in (0, 1)]
+    parts = api.run(config, tmp_path / "run").run.at().nodes
+    centres = [parts[f"centres/{centre}"]["centre_D"] for centre in (0, 1)]
     with es_service.evaluator(config) as evaluate:
         np.testing.assert_array_equal(evaluate.initial(1), centres[1])
         moved = np.abs(evaluate.initial() - centres[0]).max()

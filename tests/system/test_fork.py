@@ -19,7 +19,6 @@ from es_service.cli.commands import error_message
 from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError
-from es_service.loop.parts import CELL_PREFIX
 from es_service.protocol.options import choice
 from es_service.report.data import read_run
 from es_service.report.facts import verdict
@@ -29,6 +28,7 @@ from es_service.runs.session import dispatch_limits
 from es_service.store import reader
 from es_service.store.digest import digest_at
 from es_service.store.reader import read_generation
+from tests.helpers import map_of
 from tests.system.command_line import digest, es
 from tests.system.session import ROOT, SMALL, finish
 from workers.environments import SHIPPED
@@ -53,9 +53,9 @@ def parent(tmp_path_factory, workers_here):
 def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
     """Sums of rewards are far below the last reward alone: against its record nothing would ever be an improvement."""
     parent = run(tmp_path / "parent", "task.fitness=final", "budget.generations=6")
-    before = parent.parts()[1]["weight"]
+    before = parent.at().nodes["weight"]
     forked = fork(parent, tmp_path / "fork", "task.fitness=sum", "budget.generations=8")
-    after, history = forked.parts()[1]["weight"], forked.history
+    after, history = forked.at().nodes["weight"], forked.history
     assert before["value"] < 1.0
     assert after["record"] == history["centre_fitness_mean"].iloc[7:].max() < before["record"]
     assert history["fitness_weight"].iloc[7] == before["value"] < history["fitness_weight"].iloc[8]
@@ -75,10 +75,10 @@ def test_searches_with_the_same_state_may_follow_one_another(tmp_path, algorithm
         assert rows.loc[:4, column].tolist() == parent.history[column].tolist()
     assert rows.loc[5, "fitness_weight"] == weight
     assert rows.loc[5, "archive_size"] == rows.loc[4, "archive_size"] + 1
-    before, after = parent.parts()[1], child.parts(5)[1]
+    before, after = parent.at().nodes, child.at(5).nodes
     moved = int(rows.loc[5, "centre"])
     for index in {0, 1, 2} - {moved}:
-        assert (after[f"centre_{index}"]["centre_D"] == before[f"centre_{index}"]["centre_D"]).all()
+        assert (after[f"centres/{index}"]["centre_D"] == before[f"centres/{index}"]["centre_D"]).all()
     with pytest.raises(ConfigError, match="would have no effect"):
         lineage.fork_config(parent.folder, [f"search.algorithm={other}", "search.fitness_weight_start=0.75"])
     with pytest.raises(ConfigError) as refused:
@@ -214,7 +214,7 @@ def test_without_normalisation_no_statistics_are_used_nor_a_centre_s_own(parent,
     search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "parent_statistics": "elite"}
     wanted = ("search.block_generations=8", f"search.init_from={parent.folder}", "budget.generations=6")
     begun = run(tmp_path / "begun", *wanted, config=SMALL | {"search": search})
-    assert "own_std_O" in begun.parts()[1]["centre_0"]
+    assert "own_std_O" in begun.at().nodes["centres/0"]
     assert (begun.policy("centre").observation_std_O != 1.0).all()
     forked = fork(begun, tmp_path / "fork", "policy.observation_normalization=false", "budget.generations=7")
     assert forked.constants["policy.observation_clip"] is None
@@ -225,7 +225,7 @@ def test_without_normalisation_no_statistics_are_used_nor_a_centre_s_own(parent,
         np.testing.assert_array_equal(policy.observation_std_O, 1.0)
     assert len(elites) == 1
     kept, gone = (
-        lineage.forked(begun, lineage.fork_config(begun.folder, overrides), None)[1].parts["centre_0"]
+        lineage.forked(begun, lineage.fork_config(begun.folder, overrides), None)[1].parts["centres/0"]
         for overrides in ([], ["search.parent_statistics=global"])
     )
     assert kept.keys() - gone.keys() == {"own_mean_O", "own_std_O"}
@@ -235,7 +235,7 @@ def test_a_start_from_a_run_that_did_not_normalise_takes_no_statistics(parent, t
     """Which it has gathered, and its policy never saw."""
     told: list[str] = []
     raw = run(tmp_path / "raw", "policy.observation_normalization=false", "budget.generations=2")
-    assert raw.parts()[1]["observations"]["count"] > 0
+    assert raw.at().nodes["observations"]["count"] > 0
 
     def start(origin, *overrides):
         wanted = api.load_config(SMALL, [f"search.init_from={origin.folder}", *overrides])
@@ -304,10 +304,8 @@ def test_scores_of_a_population_that_was_luckier_or_less_are_forgotten(tmp_path)
         ("search.sigma=0.5", False), ("policy.action_noise=0", False),
     ):  # fmt: skip
         config = lineage.fork_config(parent.folder, [override])
-        parts = lineage.forked(parent, config, None)[1].parts
-        scores = [float(part["score"]) for name, part in parts.items() if name.startswith(CELL_PREFIX)]
-        assert len(scores) == parent.behaviour_map.size
-        np.testing.assert_array_equal(sorted(scores), sorted(known if same else known * np.nan))
+        scores = map_of(lineage.forked(parent, config, None)[1].parts).score_N
+        np.testing.assert_array_equal(scores, known if same else known * np.nan)
 
 
 def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_path):
@@ -344,10 +342,10 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     assert code == 0, printed
     child, parent = open_run(tmp_path / "r"), open_run(finished[0])
     assert child.generation == 0
-    _, parts = child.parts()
-    assert (parts["observations"]["m2_O"] == parent.parts()[1]["observations"]["m2_O"]).all()
+    parts = child.at().nodes
+    assert (parts["observations"]["m2_O"] == parent.at().nodes["observations"]["m2_O"]).all()
     for centre in range(5):
-        assert (parts[f"centre_{centre}"]["centre_D"] == parent.policy("centre").parameters_D).all()
+        assert (parts[f"centres/{centre}"]["centre_D"] == parent.policy("centre").parameters_D).all()
     assert child.meta.parent is not None
     assert child.meta.parent["digest"] == digest(finished[0])
     code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
@@ -368,9 +366,9 @@ def test_init_from_the_best_centre_or_a_cell_s_elite(tmp_path):
         assert child.generation == 1
         policy = origin.policy(wanted)
         kept = api.run(api.load_config(mapping, setting | {"budget.generations": None, "budget.target_fitness": -1e9}),
-                       tmp_path / f"at_{which}").run.parts()[1]  # fmt: skip
+                       tmp_path / f"at_{which}").run.at().nodes  # fmt: skip
         for index in range(child.constants["search.centres"]):
-            assert (kept[f"centre_{index}"]["centre_D"] == policy.parameters_D).all()
+            assert (kept[f"centres/{index}"]["centre_D"] == policy.parameters_D).all()
         observed = kept["observations"]
         assert observed["count"] > 0
         np.testing.assert_array_equal(observed["mean_O"].astype(np.float32), policy.observation_mean_O)

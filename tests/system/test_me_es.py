@@ -128,6 +128,7 @@ def test_policies_have_the_statistics_of_their_evaluation(tmp_path):
         np.testing.assert_array_equal(policy.observation_std_O, elite.observation_std_O)
         others += not np.array_equal(policy.observation_mean_O, newest.observation_mean_O)
     assert others
-    best, kept = found.policy("best"), found.parts()[1]["best"]
-    np.testing.assert_array_equal(best.observation_mean_O, kept["observation_mean_O"])
-    np.testing.assert_array_equal(best.observation_std_O, kept["observation_std_O"])
+    snapshot = found.at(named=lambda snapshot: [snapshot.best.policy.tobytes()])
+    best, [content] = found.policy("best"), snapshot.contents.values()
+    np.testing.assert_array_equal(best.observation_mean_O, content["observation_mean_O"])
+    np.testing.assert_array_equal(best.observation_std_O, content["observation_std_O"])

@@ -82,8 +82,8 @@ def test_a_state_is_read_once(finished, tmp_path, monkeypatch):
     from es_service.loop import driver
 
     shutil.copytree(finished[0], tmp_path / "run")
-    read, inner = [], driver.state_from_parts
-    monkeypatch.setattr(driver, "state_from_parts", lambda *given: read.append(given[1]) or inner(*given))
+    read, inner = [], driver.state_of
+    monkeypatch.setattr(driver, "state_of", lambda *given: read.append(given[1]) or inner(*given))
     assert api.resume(tmp_path / "run", ["budget.generations=31"]).run.generation == 31
     assert read == [30]
 

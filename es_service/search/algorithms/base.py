@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from es_service.config.parts import Objective
 from es_service.protocol.episodes import part_of
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray
+from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.recipes import Recipes
+from es_service.search.arrays import freeze, read_only
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive, sound_archive
-from es_service.search.state_parts import freeze, read_only
 from es_service.search.steps import StepState, restarted
 
 NO_ENTRY = -1
@@ -66,8 +66,8 @@ class SearchState:
     A search of your own may change all of it in any way: the store compares contents with the state before and writes
     what differs. Centres may be replaced, added and removed (one must remain), the novelty archive may lose entries
     (`novelty.archive_of` makes one of any), and entries of the behaviour map may change, move and leave
-    (`behaviour_map.changed`, `moved`, `removed`). The policy of an elite follows its entry, which is known by its
-    generation and centre. All arrays of a state are read-only.
+    (`behaviour_map.changed`, `moved`, `removed`). An entry has the name of its policy, which is stored as long as
+    anything in a state names it. All arrays of a state are read-only.
     """
 
     centres: tuple[CentreState, ...]
@@ -76,11 +76,7 @@ class SearchState:
     map: BehaviourMap | None = None
     """The behaviour map; None if `map.enabled` is false."""
     extra: Mapping[str, Any] = field(default_factory=dict)
-    """What else the search remembers, by name: arrays and what `search.state_parts` describes."""
-    elites: Mapping[int, Elite] = field(default_factory=dict)
-    """Policies of elites by cell, which are not part of the state, since the store keeps them. `ask` sees those of the
-    cells that `Algorithm.parents` has named; `tell` may return policies for entries that it has put into the map by
-    itself, such as one that had left it."""
+    """What else the search remembers, by name: arrays, and mappings of such (`search.arrays`)."""
 
 
 def frozen(state: SearchState) -> SearchState:
@@ -151,8 +147,9 @@ class PolicyAsk:
     of the generation that are for policies.
     """
 
-    parameters_N_D: FloatArray | Recipes
-    """Parameters of each policy, or recipes by which workers make them."""
+    parameters_N_D: FloatArray | Recipes | NDArray[Any]
+    """Parameters of each policy; or recipes by which workers make them; or names of stored policies [N], which are
+    evaluated with the observation statistics that they have."""
     observation_mean_N_O: FloatArray | None = None
     observation_std_N_O: FloatArray | None = None
     """Mean and standard deviation with which each policy's episodes normalise observations; None: 0 and 1."""
@@ -196,8 +193,9 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
     episodes: int = 1
     results: EpisodesResult | None = None
     """Results of each episode, [N, E]."""
-    points: Callable[[Sequence[int]], Sequence[Centre]] | None = None
-    """Function from indices on axis N to what was evaluated: parameters and observation statistics."""
+    names: Callable[[Sequence[int]], tuple[NDArray[Any], NDArray[Any]]] | None = None
+    """Function from indices on axis N to the names of the policies that were evaluated, and of their traces. What a
+    state names is stored."""
 
     def __len__(self) -> int:
         return len(self.centre_N)
@@ -253,12 +251,9 @@ class Algorithm:
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
     """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
     other centres continue."""
-    parents: Callable[[SearchState, int], Sequence[int]] = lambda state, generation: ()
-    """(state, generation) -> cells whose elites `ask` needs; they are then in `SearchState.elites`."""
     restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
     extra: Mapping[str, Any] = field(default_factory=dict)
-    """What else the search remembers, by name, with its first values: arrays, and what `search.state_parts` describes.
-    """
+    """What else the search remembers, by name, at first: arrays, and mappings of such (`search.arrays`)."""
     counts_samples: bool = False
     """Whether the entries of the map count the episodes of which their values are the mean."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from pydantic import Field
 from es_service.config.model import RunConfig
 from es_service.config.parts import CountAtOnce, Elites, MeasuredNewcomers, NotNegative, Once
 from es_service.config.search import SearchConfig, same
+from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
@@ -37,7 +39,6 @@ from es_service.search.algorithms.measured import (
     drawn_rows,
     extra_of,
     kept_of,
-    parameters_of,
     shares,
     told_of_samples,
 )
@@ -94,19 +95,11 @@ def map_elites(config: RunConfig) -> Algorithm:
     if isinstance(search.elites, MeasuredNewcomers):
         return _with_measured_elites(config, search, search.elites)
 
-    def parents(state: SearchState, generation: int) -> list[int]:
-        has_elites = state.map is not None and state.map.size
-        return np.unique(parent_cells(config, state, generation)).tolist() if has_elites else []
-
     def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
-        known = {cell: elite.centre_D for cell, elite in state.elites.items()}
-        known = known or {index: centre.centre_D for index, centre in enumerate(state.centres)}
-        drawn = np.array(sorted(known))  # all of them are elites that were drawn, or else some are centres
-        parent_N_2 = np.searchsorted(drawn, parent_cells(config, state, generation))
+        drawn, parent_N_2 = np.unique(parent_cells(config, state, generation), return_inverse=True)
         key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(search.batch))
-        parents = [known[parent] for parent in drawn.tolist()]
         rule = IsoLine(search.iso_sigma, search.line_sigma)
-        return (PolicyAsk(recipes_of(rule, parents, parent_N_2, key_N_4)),)
+        return (PolicyAsk(recipes_of(rule, parents(state, drawn), parent_N_2.reshape(-1, 2), key_N_4)),)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         if evaluations[0].generation == 0:
@@ -119,7 +112,7 @@ def map_elites(config: RunConfig) -> Algorithm:
         map_ = insert_each(map_, told.descriptor_N_B[valid], told.fitness_N[valid], generation, *columns, told.episodes)
         return replace(state, map=map_)
 
-    return Algorithm(ask, tell, parents=parents)
+    return Algorithm(ask, tell)
 
 
 def _with_measured_elites(config: RunConfig, search: MapElitesSettings, elites: MeasuredNewcomers) -> Algorithm:
@@ -136,17 +129,17 @@ def _with_measured_elites(config: RunConfig, search: MapElitesSettings, elites: 
     def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
         kept, count, rows = of_generation(state, generation)
         if kept.size:
-            serial_N_2 = kept.serial_K[parent_rows(config, elites, kept, state, generation)[:count]]
-            drawn, index_N_2 = np.unique(serial_N_2, return_inverse=True)
-            parents = parameters_of(state, drawn.tolist())
+            row_N_2 = parent_rows(config, elites, kept, state, generation)[:count]
+            serials, index_N_2 = np.unique(kept.serial_K[row_N_2], return_inverse=True)
+            named = kept.policy_K[np.argsort(kept.serial_K)[np.searchsorted(np.sort(kept.serial_K), serials)]]
         else:
             drawn, index_N_2 = np.unique(parent_cells(config, state, generation)[:count], return_inverse=True)
-            parents = [state.centres[index].centre_D for index in drawn.tolist()]
+            named = parents(state, drawn)
         key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(count))
         # Sample s of policy n has number s * count + n, and resets of its own.
         samples, rule = (elites.first_samples, 1), IsoLine(search.iso_sigma, search.line_sigma)
-        recipes = recipes_of(rule, parents, np.tile(index_N_2.reshape(-1, 2), samples), np.tile(key_N_4, samples))
-        return (PolicyAsk(recipes), *asked_again(state, kept, rows))
+        recipes = recipes_of(rule, named, np.tile(index_N_2.reshape(-1, 2), samples), np.tile(key_N_4, samples))
+        return (PolicyAsk(recipes), *asked_again(kept, rows))
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         told = in_columns(evaluations)
@@ -159,6 +152,19 @@ def _with_measured_elites(config: RunConfig, search: MapElitesSettings, elites: 
         return told_of_samples(config, elites, state, told, index_S_N.T, rows, np.arange(index_S_N.size, len(told)))
 
     return Algorithm(ask, tell, extra=extra_of(config, elites), counts_samples=True)
+
+
+def parents(state: SearchState, drawn: NDArray[np.int64]) -> Sequence[FloatArray] | NDArray[Any]:
+    """The elites of some cells, by name; while the map is empty, the centres of these indices.
+
+    Args:
+        drawn: some of `parent_cells`, increasing.
+    """
+    map_ = state.map
+    if map_ is None or not map_.size:
+        return [state.centres[index].centre_D for index in drawn.tolist()]
+    sorted_rows = np.argsort(map_.cell_N)
+    return map_.policy_N[sorted_rows[np.searchsorted(map_.cell_N, drawn, sorter=sorted_rows)]]
 
 
 def parent_rows(

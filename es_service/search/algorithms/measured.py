@@ -5,7 +5,7 @@ and, with its new sample, put back where all of its samples say, so that luck fa
 policy whose new sample is invalid leaves. A sample is the mean of `search.evaluation_episodes` episodes; the resets of
 the samples of a policy are all different.
 
-The kept policies are part of the search's own state: their values, the policies and, where the estimate is the median,
+The kept policies are part of the search's own state: their values and names and, where the estimate is the median,
 their newest samples. If the map was emptied, as by a fork whose fitness means something else, nothing is kept.
 
 Axes: K kept policies, N new policies, S samples of each, R policies that are measured again.
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from es_service.config.model import RunConfig
 from es_service.config.parts import Measured, MeasuredNewcomers
 from es_service.config.search import PopulationConfig
+from es_service.protocol.content import NAME
 from es_service.protocol.noise import Domain, stream_keys, uniforms
-from es_service.protocol.recipes import unvaried
 from es_service.search.algorithms.base import (
     NO_CELL,
     Algorithm,
@@ -36,7 +36,8 @@ from es_service.search.algorithms.base import (
 )
 from es_service.search.algorithms.common import add_to_archive, add_to_archive_and_map
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
-from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap, Elite, make_elite, rows_in
+from es_service.search.arrays import read_only
+from es_service.search.maps.behaviour_map import EMPTY
 from es_service.search.maps.kept import (
     COLUMNS,
     KeptPolicies,
@@ -50,14 +51,16 @@ from es_service.search.maps.kept import (
     with_means,
     with_values,
 )
-from es_service.search.state_parts import Arrays, ByCell, Whole, read_only
 
 AGAIN_CHOICE, PLACE_CHOICE, LAYER_CHOICE = 6, 7, 8
 """Last ids of the random streams of Domain.SELECTION: for the policies that are measured again, for the residents that
 new ones replace, and for the parents among the policies of a cell."""
-KEPT, POLICIES, SAMPLES = "kept", "policies", "samples"
-"""Names of the search's own values: those of `KeptPolicies`; and by the number of a policy the policy itself, and its
-newest samples if the estimate is the median."""
+KEPT, SAMPLES = "kept", "samples"
+"""Names of the search's own values: the arrays of `KeptPolicies`; and if the estimate is the median, the newest samples
+of all of them, one policy after another: `fitness` and `descriptor_B`, whose first axis they share."""
+FITNESS, DESCRIPTORS = "fitness", "descriptor_B"
+Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""The newest samples of a policy: fitness [S] and descriptors [S, B]."""
 MOST_SAMPLES = 500
 """Samples of a policy of which the median is taken, the newest. Source: the code of Extract-QD."""
 NONE = np.zeros(0, np.int64)
@@ -65,20 +68,15 @@ NONE = np.zeros(0, np.int64)
 
 def extra_of(config: RunConfig, settings: Measured) -> dict[str, Any]:
     """`Algorithm.extra` of a search that keeps policies."""
-    extra: dict[str, Any] = {KEPT: Whole(kept_to_arrays(empty_kept(len(config.map.bounds)))), POLICIES: ByCell()}
-    return extra | ({SAMPLES: ByCell()} if settings.estimate == "median" else {})
+    dimensions = len(config.map.bounds)
+    extra: dict[str, Any] = {KEPT: kept_to_arrays(empty_kept(dimensions))}
+    return extra | ({SAMPLES: _in_one([], dimensions)} if settings.estimate == "median" else {})
 
 
 def kept_of(state: SearchState) -> KeptPolicies:
     """The values of the policies that a search keeps."""
-    kept = kept_from_arrays(state.extra[KEPT].arrays)
+    kept = kept_from_arrays(state.extra[KEPT])
     return kept if state.map is not None and state.map.size else at_rows(kept, NONE)
-
-
-def parameters_of(state: SearchState, serials: Sequence[int]) -> list[NDArray[np.float32]]:
-    """Parameters of kept policies, by their numbers."""
-    entries = state.extra[POLICIES].entries
-    return [entries[serial]["centre_D"] for serial in serials]
 
 
 def drawn_rows(config: RunConfig, settings: Measured, kept: KeptPolicies, generation: int, episodes: int) -> NDArray:
@@ -92,20 +90,9 @@ def drawn_rows(config: RunConfig, settings: Measured, kept: KeptPolicies, genera
     return drawn_again(kept, count, settings.draw, uniforms(key, np.arange(kept.size, dtype=np.uint32)))
 
 
-def asked_again(state: SearchState, kept: KeptPolicies, rows: NDArray[np.int64]) -> tuple[PolicyAsk, ...]:
-    """The ask for the policies of some rows; nothing for none.
-
-    They are recipes without noise: workers that know a policy, as a parent of others perhaps, need not be sent it.
-    """
-    if not rows.size:
-        return ()
-    entries = state.extra[POLICIES].entries
-    policies = [entries[serial] for serial in kept.serial_K[rows].tolist()]
-
-    statistics = (
-        np.stack([policy[name] for policy in policies]) for name in ("observation_mean_O", "observation_std_O")
-    )
-    return (PolicyAsk(unvaried([policy["centre_D"] for policy in policies]), *statistics),)
+def asked_again(kept: KeptPolicies, rows: NDArray[np.int64]) -> tuple[PolicyAsk, ...]:
+    """The ask for the policies of some rows; nothing for none."""
+    return (PolicyAsk(kept.policy_K[rows]),) if rows.size else ()
 
 
 def told_of_samples(
@@ -126,13 +113,10 @@ def told_of_samples(
         again_R: indices in `told` of their samples.
     """
     assert state.map is not None, "a search that keeps policies has a map"
+    if told.names is None:
+        raise TypeError("elites that are measured again need the evaluations as the loop tells them, with `names`")
     kept, extra = kept_of(state), dict(state.extra)
-    known = set(kept.serial_K.tolist())
-    samples: dict[int, Arrays] | None = None
-    if SAMPLES in extra:
-        samples = {
-            serial: policy_samples for serial, policy_samples in extra[SAMPLES].entries.items() if serial in known
-        }
+    samples = _by_serial(kept, extra[SAMPLES]) if SAMPLES in extra else None
     is_valid_R = told.valid_N[again_R]
     kept = _with_new_samples(kept, told, rows_R[is_valid_R], again_R[is_valid_R], samples)
     comes_K = np.zeros(kept.size, bool)
@@ -150,16 +134,17 @@ def told_of_samples(
     uniform_K = uniforms(key, np.arange(resident.size, dtype=np.uint32)) if how == "any" else None
     kept = put(resident, coming, state.map.geometry, settings.depth, how, uniform_K)
     entered = np.flatnonzero(np.isin(new.serial_K, kept.serial_K))
-    extra[KEPT] = Whole(kept_to_arrays(kept))
-    extra[POLICIES] = _policies(extra[POLICIES].entries, known, kept, new.serial_K[entered], told, new_N_S[entered, 0])
+    at_new = np.isin(kept.serial_K, new.serial_K)
+    first_N = new_N_S[np.searchsorted(new.serial_K, kept.serial_K[at_new]), 0]
+    for column, named in zip((kept.policy_K, kept.trace_K), told.names(first_N.tolist()), strict=True):
+        column[at_new] = named  # `put` has made these arrays
+    extra[KEPT] = kept_to_arrays(kept)
     if samples is not None:
         for n in entered.tolist():
             rows_S = new_N_S[n]
             samples[int(new.serial_K[n])] = _samples(told.fitness_N[rows_S], told.descriptor_N_B[rows_S])
-        extra[SAMPLES] = ByCell({serial: samples[serial] for serial in kept.serial_K.tolist()})
-    map_ = top_layer(kept, state.map)
-    elites = _elites(map_, state.map, kept, extra[POLICIES], told.generation)
-    return replace(state, map=map_, extra=read_only(extra), elites=elites)
+        extra[SAMPLES] = _in_one([samples[serial] for serial in kept.serial_K.tolist()], kept.descriptor_K_B.shape[1])
+    return replace(state, map=top_layer(kept, state.map), extra=read_only(extra))
 
 
 def _with_new_samples(
@@ -167,7 +152,7 @@ def _with_new_samples(
     told: CentreEvaluations,
     rows_R: NDArray[np.int64],
     again_R: NDArray[np.int64],
-    samples: dict[int, Arrays] | None,
+    samples: dict[int, Samples] | None,
 ) -> KeptPolicies:
     """The policies with one new valid sample for some of them; `samples`, if there are any, get these, too."""
     fitness_R, descriptor_R_B = told.fitness_N[again_R], told.descriptor_N_B[again_R]
@@ -176,19 +161,31 @@ def _with_new_samples(
     for row, fitness, descriptor_B in zip(rows_R.tolist(), fitness_R, descriptor_R_B, strict=True):
         serial = int(kept.serial_K[row])
         before = samples[serial]
-        samples[serial] = _samples(
-            np.append(before["fitness_S"], fitness), np.concatenate([before["descriptor_S_B"], descriptor_B[None]])
-        )
+        samples[serial] = _samples(np.append(before[0], fitness), np.concatenate([before[1], descriptor_B[None]]))
     newest = [samples[int(serial)] for serial in kept.serial_K[rows_R]]
-    median_R = np.array([np.median(policy_samples["fitness_S"]) for policy_samples in newest])
-    median_R_B = np.array([np.median(policy_samples["descriptor_S_B"], axis=0) for policy_samples in newest])
+    median_R = np.array([np.median(fitness_S) for fitness_S, _ in newest])
+    median_R_B = np.array([np.median(descriptor_S_B, axis=0) for _, descriptor_S_B in newest])
     return with_values(kept, rows_R, median_R, median_R_B.reshape(descriptor_R_B.shape))
 
 
-def _samples(fitness_S: NDArray[np.float64], descriptor_S_B: NDArray[np.float64]) -> Arrays:
-    return read_only(
-        {"fitness_S": fitness_S[-MOST_SAMPLES:].copy(), "descriptor_S_B": descriptor_S_B[-MOST_SAMPLES:].copy()}
-    )
+def _samples(fitness_S: NDArray[np.float64], descriptor_S_B: NDArray[np.float64]) -> Samples:
+    return fitness_S[-MOST_SAMPLES:], descriptor_S_B[-MOST_SAMPLES:]
+
+
+def _by_serial(kept: KeptPolicies, arrays: Mapping[str, NDArray[np.float64]]) -> dict[int, Samples]:
+    """The newest samples of each kept policy, by its number; inverse of `_in_one`."""
+    ends = np.cumsum(np.minimum(kept.samples_K, MOST_SAMPLES))[:-1]
+    fitness, descriptors = (np.split(arrays[name], ends) for name in (FITNESS, DESCRIPTORS))
+    return dict(zip(kept.serial_K.tolist(), zip(fitness, descriptors, strict=True), strict=False))
+
+
+def _in_one(samples: Sequence[Samples], dimensions: int) -> dict[str, NDArray[np.float64]]:
+    """The samples of several policies, one after another."""
+    fitness, descriptors = zip(*samples, strict=True) if samples else ((), ())
+    return {
+        FITNESS: np.concatenate([np.zeros(0), *fitness]),
+        DESCRIPTORS: np.concatenate([np.zeros((0, dimensions)), *descriptors]),
+    }
 
 
 def _newcomers(
@@ -206,45 +203,9 @@ def _newcomers(
         np.full(count, told.generation),
         told.centre_N[new_N_S[:, 0]].astype(np.int64),
         told.population_max_N[new_N_S[:, 0]],
+        np.zeros(count, NAME),
+        np.zeros(count, NAME),
     )
-
-
-def _policies(
-    before: Mapping[int, Arrays],
-    known: set[int],
-    kept: KeptPolicies,
-    serials: NDArray[np.int64],
-    told: CentreEvaluations,
-    rows: NDArray[np.int64],
-) -> ByCell:
-    """The policies that are kept now.
-
-    Args:
-        before: those before, of which `known` count.
-        serials: numbers of the new ones that are kept.
-        rows: indices of their first samples in `told`.
-    """
-    if told.points is None or told.results is None or told.results.trace_T_B is None:
-        raise TypeError("elites that are measured again need the evaluations as the loop tells them, with `points`")
-    policies = {serial: before[serial] for serial in kept.serial_K.tolist() if serial in known}
-    points = told.points(rows.tolist())
-    for serial, row, point in zip(serials.tolist(), rows.tolist(), points, strict=True):
-        policies[serial] = read_only(vars(make_elite(point, told.results.trace_T_B[row].copy())))
-    return ByCell(policies)
-
-
-def _elites(
-    map_: BehaviourMap, before: BehaviourMap, kept: KeptPolicies, policies: ByCell, generation: int
-) -> dict[int, Elite]:
-    """By cell, the elites that are others than before and were not first evaluated in this generation: those that rose
-    from below, or came from another cell."""
-    is_same_N, row_N = rows_in(map_, before)
-    for name in ("generation_N", "centre_N"):
-        is_same_N = is_same_N & (getattr(map_, name) == np.append(getattr(before, name), EMPTY)[row_N])
-    cells = map_.cell_N[~is_same_N & (map_.generation_N != generation)]
-    top = at_rows(kept, kept.top_rows)
-    serials = top.serial_K[np.searchsorted(top.cell_K, cells)]
-    return {int(cell): Elite(**policies.entries[int(serial)]) for cell, serial in zip(cells, serials, strict=True)}
 
 
 # Searches that move centres
@@ -297,7 +258,7 @@ def measuring(config: RunConfig, algorithm: Algorithm) -> Algorithm:
     def ask(state: SearchState, generation: int) -> tuple[Any, ...]:
         kept = kept_of(state)
         rows = drawn_rows(config, elites, kept, generation, _again(config, elites))
-        return (*algorithm.ask(state, generation), *asked_again(state, kept, rows))
+        return (*algorithm.ask(state, generation), *asked_again(kept, rows))
 
     return replace(algorithm, ask=ask, extra={**algorithm.extra, **extra_of(config, elites)}, counts_samples=True)
 
@@ -322,7 +283,7 @@ def _scored(state: SearchState, told: CentreEvaluations, rows: NDArray[np.int64]
         if cell != NO_CELL and np.isfinite(score) and at.size:
             score_K[at] = score
     arrays = {**kept_to_arrays(kept), "score_K": score_K}
-    return replace(state, extra=read_only({**state.extra, KEPT: Whole(arrays)}))
+    return replace(state, extra=read_only({**state.extra, KEPT: arrays}))
 
 
 # Searches whose newcomers are measured several times

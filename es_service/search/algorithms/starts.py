@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from es_service.config.model import NoveltyConfig, RunConfig
 from es_service.search.algorithms.base import SearchState
+from es_service.search.arrays import read_only
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import cell_count
 from es_service.search.novelty import NoveltyArchive, novelty
-from es_service.search.state_parts import read_only
 
 Starts = Literal["uniform", "novelty", "least_tried", "fitness"]
 Restart = Callable[[SearchState, int, int, Elite], SearchState]

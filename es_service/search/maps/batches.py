@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap, columns_of, orders
+from es_service.protocol.content import NAME
+from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap, columns_of
 
 
 def insert_each(
@@ -44,6 +45,7 @@ def insert_each(
         "generation_N": np.full(cell_Q.shape, generation),
         "centre_N": centre_Q,
         "score_N": score_Q,
+        **dict.fromkeys(("policy_N", "trace_N"), np.zeros(cell_Q.shape, NAME)),
         "samples_N": np.full(cell_Q.shape, samples),
     }
     if not is_better.any() and not filling.size:
@@ -52,7 +54,4 @@ def insert_each(
     for name, values in columns_of(map_).items():
         columns[name] = np.concatenate([values, given_Q[name][filling].astype(values.dtype)])
         columns[name][row[is_better]] = given_Q[name][fittest[is_better]]
-    if map_.order_N is not None:
-        order = orders(map_)
-        columns["order_N"] = np.append(order, order.max(initial=-1) + 1 + np.arange(filling.size))
     return replace(map_, **columns)

@@ -1,9 +1,8 @@
 """The behaviour map as the driver keeps it in memory: fitness, descriptor and origin of each cell's elite.
 
-An elite is the evaluated centre or policy with the highest fitness among all whose descriptor is in a cell. Its
-parameters, its observation statistics and the trace of one of its episodes are in the run store, from which they are
-read when they are needed; they follow an entry that moves to another cell, and leave with it. Most searches only
-insert; one that measures its elites again may also change, move and remove entries. All functions are pure.
+An elite is the evaluated centre or policy with the highest fitness among all whose descriptor is in a cell. An entry
+names its policy and the trace of one of its episodes, which are in the run store. Most searches only insert; one that
+measures its elites again may also change, move and remove entries. All functions are pure.
 
 Axes: N filled cells, in the order in which they were filled; B descriptor dimensions; D policy parameters; O
 observation; T points of a trace.
@@ -12,16 +11,21 @@ observation; T points of a trace.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import Centre, FloatArray
+from es_service.protocol.content import NAME
+from es_service.protocol.messages import FloatArray
 from es_service.search.maps.geometry import Geometry
 
-COLUMNS = {"fitness_N": "f8", "descriptor_N_B": "f8", "generation_N": "i8", "centre_N": "i8", "score_N": "f8"}
+COLUMNS: dict[str, Any] = {
+    **{"fitness_N": "f8", "descriptor_N_B": "f8", "generation_N": "i8", "centre_N": "i8", "score_N": "f8"},
+    **{"policy_N": NAME, "trace_N": NAME},
+}
 """Type of each array that every map has besides the numbers of its cells."""
 EMPTY = -1
 """Stands for no cell in an array of cells."""
@@ -40,17 +44,18 @@ class BehaviourMap:
     generation_N: NDArray[np.int64]
     """Generation in which each elite was first evaluated; 0 for initial centres."""
     centre_N: NDArray[np.int64]
-    """Index of the centre or policy that became the elite. With the generation it says which policy an entry has,
-    wherever the entry moves."""
+    """Index of the centre or policy that became the elite."""
     score_N: NDArray[np.float64]
     """Highest fitness of a member of the population that led to the elite or, later, of the latest population around
     it; one noisy value, which `cell_sampling: score` uses. NaN where there was no population."""
+    policy_N: NDArray[Any]
+    """Name of each elite's policy. NO_NAME stands for what was evaluated as `centre_N` in this generation; the loop
+    puts its name there when the search has been told."""
+    trace_N: NDArray[Any]
+    """Name of the trace of one of its episodes, likewise."""
     samples_N: NDArray[np.int64] | None = None
     """Number of episodes of which fitness and descriptor are the mean; None for a search that does not count them
     (`Algorithm.counts_samples`)."""
-    order_N: NDArray[np.int64] | None = None
-    """Increasing numbers that give the order in which the cells were filled; None: 0, 1, 2, ... They have gaps once an
-    entry has left."""
 
     @property
     def size(self) -> int:
@@ -77,24 +82,29 @@ class BehaviourMap:
         return np.where(is_there_Q, np.append(self.cell_N[rows], EMPTY)[found_Q], EMPTY)
 
 
+NO_TRACE = np.zeros((0, 0), np.float32)
+"""Stands for the trace of an elite where nobody needs it."""
+
+
 @dataclass(frozen=True)
 class Elite:
-    """The elite of a cell as the run store keeps it: parameters, observation statistics and trace."""
+    """The elite of a cell: the policy and the trace that its entry names."""
 
     centre_D: FloatArray
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
     """Mean and standard deviation of observations with which it was evaluated."""
-    trace_T_B: FloatArray
+    trace_T_B: FloatArray = field(default_factory=lambda: NO_TRACE)
     """Descriptor along one evaluation episode, from reset to end at equal intervals."""
 
 
 def empty_map(geometry: Geometry, *, counts_samples: bool = False) -> BehaviourMap:
     """A map without elites."""
     dimensions = len(geometry.bounds)
-    integers, numbers = np.zeros(0, np.int64), np.zeros(0)
-    samples_N = integers if counts_samples else None
-    return BehaviourMap(geometry, integers, numbers, np.zeros((0, dimensions)), integers, integers, numbers, samples_N)
+    shapes = {"descriptor_N_B": (0, dimensions)}
+    columns: dict[str, Any] = {name: np.zeros(shapes.get(name, 0), kind) for name, kind in COLUMNS.items()}
+    none_N = np.zeros(0, np.int64)
+    return BehaviourMap(geometry, none_N, **columns, samples_N=none_N if counts_samples else None)
 
 
 def insert(
@@ -124,6 +134,7 @@ def insert(
         "generation_N": generation,
         "centre_N": centre,
         "score_N": score,
+        **dict.fromkeys(("policy_N", "trace_N"), np.zeros((), NAME)),
         **({} if map_.samples_N is None else {"samples_N": samples}),
     }
     return _offered(map_, cell, entry)
@@ -154,9 +165,7 @@ def removed(map_: BehaviourMap, cell: int) -> BehaviourMap:
     row = map_.row_of(cell)
     if row is None:
         return map_
-    columns = {name: np.delete(values, row, axis=0) for name, values in columns_of(map_).items()}
-    order_N = np.delete(orders(map_), row)
-    return replace(map_, **columns, order_N=None if np.array_equal(order_N, np.arange(order_N.size)) else order_N)
+    return replace(map_, **{name: np.delete(values, row, axis=0) for name, values in columns_of(map_).items()})
 
 
 def moved(map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64]) -> tuple[BehaviourMap, int, bool]:
@@ -204,42 +213,6 @@ def resampled(
     return moved(changed(map_, cell, fitness=fitness, samples=total), cell, descriptor_B)
 
 
-def orders(map_: BehaviourMap) -> NDArray[np.int64]:
-    """Number of each entry in the order in which the cells were filled, [N], increasing.
-
-    `BehaviourMap.order_N` counts if it is such numbers; otherwise a search has put the entries into another order.
-    """
-    order_N = map_.order_N
-    if order_N is not None and order_N.shape == map_.cell_N.shape and (np.diff(order_N) > 0).all():
-        return order_N
-    return np.arange(map_.size)
-
-
-def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bool_]:
-    """Whether each entry is the same, bit for bit, as that of its cell in an earlier map, with its order, [N]."""
-    was_N, row_N = rows_in(map_, before)
-    now, then = ({**columns_of(each_map), "order_N": orders(each_map)} for each_map in (map_, before))
-    if now.keys() != then.keys():  # one map counts samples
-        return np.zeros(map_.size, bool)
-    same_N = was_N.copy()
-    for name in now:
-        if now[name] is not then[name] or map_.cell_N is not before.cell_N:
-            same_N[was_N] &= (_bytes(now[name][was_N]) == _bytes(then[name][row_N[was_N]])).all(axis=1)
-    return same_N
-
-
-def rows_in(map_: BehaviourMap, other: BehaviourMap) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Whether each cell is filled in another map, [N], and the index of its entry there, [N] (0 if it is not)."""
-    first, row_N = min(map_.size, other.size), np.arange(map_.size)
-    if np.array_equal(map_.cell_N[:first], other.cell_N[:first]):  # no entry has left, as in most searches
-        return row_N < first, np.where(row_N < first, row_N, 0)
-    sorted_rows = np.argsort(other.cell_N)
-    found_N = np.searchsorted(other.cell_N, map_.cell_N, sorter=sorted_rows)
-    row_N = np.append(sorted_rows, 0)[found_N]
-    was_N = np.append(other.cell_N, -1)[np.append(sorted_rows, other.size)[found_N]] == map_.cell_N
-    return was_N, np.where(was_N, row_N, 0)
-
-
 def map_statistics(
     map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool_] | None
 ) -> dict[str, float | None]:
@@ -261,19 +234,41 @@ def map_statistics(
     }
 
 
-def make_elite(centre: Centre, trace_T_B: FloatArray) -> Elite:
-    """The elite made of a centre that has entered the map."""
-    return Elite(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, trace_T_B)
+def with_names(
+    map_: BehaviourMap,
+    generation: int,
+    index_N: NDArray[np.int64],
+    names: Callable[[Sequence[int]], tuple[NDArray[Any], NDArray[Any]]],
+) -> BehaviourMap:
+    """The map in which entries that were evaluated in a generation name their policies and traces.
 
+    Args:
+        index_N: centres and policies that were evaluated.
+        names: function from indices on that axis to the names of the policies and of the traces.
 
-def _bytes(values_N: np.ndarray) -> NDArray[np.uint8]:
-    """The bytes of each entry, [N, bytes], so that NaN equals NaN, and 0 does not equal -0."""
-    entry_bytes = values_N.dtype.itemsize * math.prod(values_N.shape[1:])
-    return np.frombuffer(values_N.tobytes(), np.uint8).reshape(-1, entry_bytes)
+    Raises:
+        ValueError: an entry without a name was not evaluated in this generation.
+    """
+    rows = np.flatnonzero(map_.policy_N == np.zeros((), NAME))
+    if not rows.size:
+        return map_
+    order = np.argsort(index_N, kind="stable")
+    found = np.append(order, -1)[np.searchsorted(index_N, map_.centre_N[rows], sorter=order)]
+    is_known = (map_.generation_N[rows] == generation) & (np.append(index_N, -1)[found] == map_.centre_N[rows])
+    if not is_known.all():
+        row = rows[~is_known][0]
+        raise ValueError(
+            f"the new elite of cell {map_.cell_N[row]} is centre {map_.centre_N[row]} of generation "
+            f"{map_.generation_N[row]}, which was not evaluated now; `policy_N` must name one that comes from elsewhere"
+        )
+    columns = {"policy_N": map_.policy_N.copy(), "trace_N": map_.trace_N.copy()}
+    for column, named in zip(columns.values(), names(found.tolist()), strict=True):
+        column[rows] = named
+    return replace(map_, **columns)
 
 
 def columns_of(map_: BehaviourMap) -> dict[str, np.ndarray]:
-    """The arrays of a map by name, without the order."""
+    """The arrays of a map by name."""
     samples = {} if map_.samples_N is None else {"samples_N": map_.samples_N}
     return {"cell_N": map_.cell_N, **{name: getattr(map_, name) for name in COLUMNS}, **samples}
 
@@ -289,8 +284,7 @@ def _offered(map_: BehaviourMap, cell: int, entry: dict[str, Any]) -> tuple[Beha
         for name, values in columns_of(map_).items()
         for value in [cell if name == "cell_N" else entry[name]]
     }
-    order_N = None if map_.order_N is None else np.append(order := orders(map_), order.max(initial=-1) + 1)
-    return replace(map_, **columns, order_N=order_N), cell, True
+    return replace(map_, **columns), cell, True
 
 
 def _with(map_: BehaviourMap, row: int, values: dict[str, Any]) -> BehaviourMap:

@@ -20,7 +20,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.search.maps.behaviour_map import BehaviourMap, orders
+from es_service.protocol.content import NAME
+from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.maps.geometry import Geometry
 
 Draw = Literal["exponential", "linear", "harmonic", "uniform"]
@@ -45,6 +46,9 @@ class KeptPolicies:
     """Generation and index of the centre or policy with which each was first evaluated: see `BehaviourMap`."""
     score_K: NDArray[np.float64]
     """See `BehaviourMap.score_N`."""
+    policy_K: NDArray[Any]
+    trace_K: NDArray[Any]
+    """Names of each policy and of its trace."""
 
     @property
     def size(self) -> int:
@@ -68,8 +72,8 @@ COLUMNS = tuple(field.name for field in fields(KeptPolicies))
 
 def empty_kept(dimensions: int) -> KeptPolicies:
     """No policies, with descriptors of some number of dimensions."""
-    whole, real = np.zeros(0, np.int64), np.zeros(0)
-    return KeptPolicies(whole, whole, real, np.zeros((0, dimensions)), whole, whole, whole, real)
+    whole, real, name = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, NAME)
+    return KeptPolicies(whole, whole, real, np.zeros((0, dimensions)), whole, whole, whole, real, name, name)
 
 
 def kept_to_arrays(kept: KeptPolicies) -> dict[str, NDArray[Any]]:
@@ -188,9 +192,6 @@ def top_layer(kept: KeptPolicies, before: BehaviourMap) -> BehaviourMap:
     is_new = ~np.isin(top.cell_K, before.cell_N)
     new_rows = np.flatnonzero(is_new)[np.argsort(top.serial_K[is_new], kind="stable")]
     in_order = at_rows(top, np.concatenate([rows[stays_N], new_rows]))
-    old_orders = orders(before)
-    next_order = old_orders.max(initial=-1) + 1
-    order_N = np.concatenate([old_orders[stays_N], next_order + np.arange(new_rows.size)])
     return BehaviourMap(
         before.geometry,
         in_order.cell_K,
@@ -199,8 +200,9 @@ def top_layer(kept: KeptPolicies, before: BehaviourMap) -> BehaviourMap:
         in_order.generation_K,
         in_order.centre_K,
         in_order.score_K,
+        in_order.policy_K,
+        in_order.trace_K,
         in_order.samples_K,
-        None if np.array_equal(order_N, np.arange(order_N.size)) else order_N,
     )
 
 

@@ -1,0 +1,138 @@
+"""Policies and traces by name: those of the generation at hand, and of those that the store has what is needed.
+
+Axes: N evaluated centres and policies, T points of a trace, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import EvaluationError, StoreError
+from es_service.loop.evaluated import Evaluated
+from es_service.protocol.content import NAME, Arrays, as_bytes, name_of, names, policy_content
+from es_service.protocol.kept import Kept
+from es_service.protocol.policy_spec import PolicySpec
+from es_service.protocol.recipes import Recipes, unvaried
+from es_service.search.algorithms.base import PolicyAsk
+from es_service.search.arrays import freeze
+from es_service.search.maps.behaviour_map import NO_TRACE, Elite
+
+RECENT_BYTES = 256 * 2**20
+"""Most bytes that are kept of policies that the store has: 400 of an ant with a 256x256 policy are 155 MB."""
+
+
+class Named:
+    """The policies that a generation has evaluated, and their traces, which get names when something needs them."""
+
+    def __init__(self, evaluated: Evaluated, spec: PolicySpec) -> None:
+        self._evaluated, self._spec = evaluated, spec
+        self._known: dict[int, tuple[bytes, bytes]] = {}
+        self.contents: dict[bytes, Arrays] = {}
+        """Those that have a name."""
+
+    def names(self, rows: Sequence[int]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Names of the policies of some rows, and of their traces."""
+        new = [row for row in dict.fromkeys(rows) if row not in self._known]
+        for row, point in zip(new, self._evaluated.points(new), strict=True):
+            statistics = point.observation_mean_O, point.observation_std_O
+            trace_N_T_B = self._evaluated.evaluation.trace_T_B
+            assert trace_N_T_B is not None, "an evaluation has a trace"
+            policy = policy_content(self._spec, point.parameters_D, *statistics)
+            self._known[row] = self._add(policy), self._add({"trace_T_B": trace_N_T_B[row].copy()})
+        self._evaluated.remember(new, [self._known[row][0] for row in new])
+        return names(self._known[row][0] for row in rows), names(self._known[row][1] for row in rows)
+
+    def _add(self, content: Arrays) -> bytes:
+        freeze(content.values())
+        name = name_of(content)
+        self.contents[name] = content
+        return name
+
+
+class Contents:
+    """The policies that a state names. Those of the newest generation need not be stored yet."""
+
+    def __init__(self, read: Callable[[bytes], Arrays], most_bytes: int = RECENT_BYTES) -> None:
+        """Keep nothing yet.
+
+        Args:
+            read: returns a content that is stored; raises KeyError if there is none of this name.
+        """
+        self._read, self._most_bytes = read, most_bytes
+        self._kept: Kept[bytes, Arrays] = Kept(lambda content: sum(array.nbytes for array in content.values()))
+        self._newest: Mapping[bytes, Arrays] = {}
+
+    def add(self, contents: Mapping[bytes, Arrays]) -> None:
+        """Take in those of a new generation. Those of the one before are stored."""
+        self._newest = contents
+
+    def of(self, wanted: Sequence[bytes]) -> dict[bytes, Arrays]:
+        """Contents by their names. Raises KeyError if there is none of one name.
+
+        One that is read takes the place of none that was asked for with it: a batch of mutants asks for nearly the
+        whole map, and if that is too large, each elite would otherwise be gone when it is needed.
+        """
+        asked, kept = dict.fromkeys(wanted), self._kept
+        kept.use(asked)
+        found: dict[bytes, Arrays] = {}
+        for name in asked:
+            content = self._newest.get(name) or kept.get(name)
+            if content is None:
+                content = self._read(name)
+                freeze(content.values())
+            if name not in kept:
+                kept.add(name, content)
+                kept.forget_oldest(self._most_bytes, spared=asked)
+                if kept.nbytes > self._most_bytes:
+                    kept.forget(name)
+            found[name] = content
+        return found
+
+    def elite(self, name: bytes) -> Elite:
+        """A policy by its name, without a trace."""
+        return elite_of(self.of([name])[name])
+
+    def completed(self, asked: object, generation: int) -> object:
+        """What a search asks for, with the parameters of the policies that it names.
+
+        Raises:
+            EvaluationError: it names a policy that nothing in the state before names.
+        """
+        if not isinstance(asked, tuple):
+            return asked
+        try:
+            return tuple(self.policies(ask) if isinstance(ask, PolicyAsk) else ask for ask in asked)
+        except KeyError as error:
+            name = error.args[0].hex()
+            text = f"generation {generation}: `ask` names the policy {name}, which nothing in the state names"
+            raise EvaluationError(text, field="search.algorithm") from error
+
+    def policies(self, ask: PolicyAsk) -> PolicyAsk:
+        """Policies that are asked for, with the parameters of those that are named. Raises KeyError as `of`."""
+        policies = ask.parameters_N_D
+        if isinstance(policies, Recipes):
+            if policies.parents:
+                return ask
+            known = {name: content["parameters_D"] for name, content in self.of(policies.names).items()}
+            return replace(ask, parameters_N_D=policies.complete(known))
+        if not isinstance(policies, np.ndarray) or policies.dtype != NAME:
+            return ask
+        wanted = as_bytes(policies)
+        contents = self.of(wanted)
+        arrays = ("observation_mean_O", "observation_std_O")
+        statistics = (np.stack([contents[name][array] for name in wanted]) for array in arrays)
+        recipes = unvaried(policies).complete({name: contents[name]["parameters_D"] for name in contents})
+        return PolicyAsk(recipes, *statistics)
+
+
+def elite_of(content: Arrays, trace: Arrays | None = None) -> Elite:
+    """An elite of a policy as it is stored, and of a trace. Raises StoreError if they are something else."""
+    if "parameters_D" not in content or (trace is not None and "trace_T_B" not in trace):
+        raise StoreError("a name in the state is not that of a policy, or of a trace")
+    mean_O, std_O = content["observation_mean_O"], content["observation_std_O"]
+    return Elite(content["parameters_D"], mean_O, std_O, NO_TRACE if trace is None else trace["trace_T_B"])

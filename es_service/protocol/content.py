@@ -1,0 +1,68 @@
+"""Arrays by the name of their content: the SHA-256 of their bits. Policies and traces are stored once under their name.
+
+What refers to them is an array of names, whose type is `NAME`, so that everybody who has the arrays of a state can see
+which contents it names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.policy_spec import PolicySpec
+
+Arrays = Mapping[str, NDArray[Any]]
+"""Name of an array -> the array."""
+Contents = Mapping[bytes, Arrays]
+"""Name of a content -> its arrays."""
+NAME = np.dtype("V32")
+"""Type of an array of names: the bytes of a SHA-256 each."""
+NO_NAME = bytes(NAME.itemsize)
+"""Stands for no name in an array of names."""
+
+
+def name_of(arrays: Arrays) -> bytes:
+    """Name of a content: SHA-256 of the name, type, shape and little-endian values of each array, sorted by name."""
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        little = np.asarray(arrays[name])
+        little = np.ascontiguousarray(little, little.dtype.newbyteorder("<")).reshape(little.shape)
+        total.update(json.dumps([name, little.dtype.str, list(little.shape)]).encode() + b"\n")
+        total.update(little.tobytes() if little.dtype == NAME or not little.size else little.data)
+    return total.digest()
+
+
+def names(values: Iterable[bytes]) -> NDArray[Any]:
+    """An array of names."""
+    return np.frombuffer(b"".join(values), NAME)
+
+
+def names_in(arrays: Arrays) -> frozenset[bytes]:
+    """All names in some arrays."""
+    found = [name for array in arrays.values() if array.dtype == NAME for name in as_bytes(array)]
+    return frozenset(found) - {NO_NAME}
+
+
+def as_bytes(name_N: NDArray[Any]) -> list[bytes]:
+    """The names of an array of names, as bytes."""
+    flat = name_N.tobytes()
+    return [flat[first : first + NAME.itemsize] for first in range(0, len(flat), NAME.itemsize)]
+
+
+def policy_content(
+    spec: PolicySpec, parameters_D: NDArray[np.float32], mean_O: NDArray[np.float32], std_O: NDArray[np.float32]
+) -> dict[str, NDArray[Any]]:
+    """A policy as it is stored, and named: its parameters, its observation statistics, and what it is."""
+    text = json.dumps(asdict(spec), sort_keys=True).encode()
+    return {
+        "parameters_D": parameters_D,
+        "observation_mean_O": mean_O,
+        "observation_std_O": std_O,
+        "spec": np.frombuffer(text, np.uint8),
+    }
