@@ -19,6 +19,7 @@ from typing import Any
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import option_values
 from es_service.protocol.parent import end_soon, write_answer
+from es_service.protocol.sources import SUITES
 from workers.environments import TaskError, describe_environment
 from workers.host.repeats import tried_apart
 from workers.rollouts import BACKENDS
@@ -53,7 +54,7 @@ def main(name: str, settings: str, file: str) -> None:
         if task.kind == "python":
             options = option_values(task.options, given.get("options", {}))
             task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options))
-        elif task.kind == "jax" and not name.startswith(("brax:", "mujoco:")):
+        elif task.kind == "jax" and name.partition(":")[0] not in ("brax", "mujoco", *SUITES):
             from workers.traces import require_pure
 
             require_pure(task, option_values(task.options, given.get("options", {})))

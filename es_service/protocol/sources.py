@@ -36,6 +36,8 @@ DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
 PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
+SUITES = ("gymnax", "playground")
+"""Packages of environments in JAX, such as `gymnax:CartPole-v1`, by their names on the package index."""
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
 MODELS, MODEL_FILES = "mujoco", "envs/mujoco/assets"
@@ -84,6 +86,9 @@ def user_sources(*names: str) -> dict[str, str]:
                 sources[LIBRARY] = metadata.version(LIBRARY)
         if name.startswith(f"{MODELS}:"):
             sources |= _models()
+        if (suite := name.partition(":")[0]) in SUITES:
+            with suppress(metadata.PackageNotFoundError):
+                sources[suite] = metadata.version(suite)
     return sources
 
 
@@ -134,13 +139,13 @@ def why_refused(expected: Sources, names: Sequence[str], platform: str = "any") 
 def user_path(name: str) -> str:
     """The code of a user that a name in a config means, as `package.module:name`; empty if it means none.
 
-    `brax:NAME` and `mujoco:ID` are none. What is simulated by Python has the kind of the task before the path, as in
-    `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module that
-    registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace; ours, as in
-    `gymnasium:es_service/AntMazeMujoco-v0`, are none.
+    `brax:NAME`, `mujoco:ID` and `SUITE:NAME` are none. What is simulated by Python has the kind of the task before the
+    path, as in `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module
+    that registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace; ours, as
+    in `gymnasium:es_service/AntMazeMujoco-v0`, are none.
     """
     kind, colon, rest = name.partition(":")
-    if kind in ("brax", "mujoco"):
+    if kind in ("brax", "mujoco", *SUITES):
         return ""
     if kind == LIBRARY:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, choice
-from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, meant_environment
+from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, SUITES, meant_environment
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -123,7 +123,7 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     """Functions of a task; imports its module, and with it JAX and the physics engine that it needs.
 
     Args:
-        name: a key of SHIPPED, `brax:NAME`, `mujoco:ID` or `package.module:Class`.
+        name: a key of SHIPPED, `brax:NAME`, `mujoco:ID`, `SUITE:NAME` or `package.module:Class`.
         options: options of the task and their values.
 
     Raises:
@@ -140,6 +140,8 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
         from workers.environments import mujoco_gym
 
         return mujoco_gym.make(rest, **options)
+    if prefix in SUITES:
+        return importlib.import_module(f"workers.environments.{prefix}_task").make(rest, **options)
     from workers.environments import user_task
 
     return user_task.make(name, options)
@@ -210,8 +212,8 @@ def settings_of_description(
 
 
 def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:
-    """Description of a task that is no shipped one, from its module. Only `brax:NAME`, `mujoco:ID` and
-    `package.module:Class` import JAX.
+    """Description of a task that is no shipped one, from its module. Those of Python objects and
+    functions do not import JAX.
 
     Args:
         settings: `settings_of_description`, and `options` with which it is tried if they are not the defaults.
@@ -229,6 +231,8 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         from workers.environments import mujoco_gym
 
         return mujoco_gym.describe(rest, options)
+    if kind in SUITES:
+        return importlib.import_module(f"workers.environments.{kind}_task").describe(rest, options)
     if is_host_task(name):
         chosen = settings.get("descriptor")
         descriptor = tuple(chosen) if isinstance(chosen, list) else chosen
