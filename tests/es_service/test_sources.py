@@ -87,7 +87,7 @@ def test_an_unchanged_checkout_at_another_path_has_the_same_code(elsewhere):
         ("es_service/protocol/noise.py", True),
         ("es_service/search/steps/adam.py", False),
         ("es_service/loop/driver.py", False),
-        ("es_service/config/presets.py", False),
+        ("es_service/config/search.py", False),
     ],
 )
 def test_an_edited_file_is_named_to_the_side_that_computes_with_it(elsewhere, file, of_workers):
