@@ -17,7 +17,7 @@ from workers.policies.policy import act, split_layers
 def test_policies_of_others_are_certified_in_the_episodes_that_certify_has(number):
     given = {"task": {"environment": "point_maze"}, "policy": {"hidden": [8]}, "search": {"algorithm": "es"}, "seed": 5}
     config = es_service.load_config(given | {"budget": {"generations": 1}})
-    shape = es_service.config.model.worker_spec(config, es_service.config.tasks.task_of(config)).policy
+    shape = es_service.config.workload.worker_spec(config, es_service.config.tasks.task_of(config)).policy
     parameters_D = np.random.default_rng(0).normal(size=shape.parameters).astype(np.float32)
     layers = split_layers(shape, parameters_D)
     found = certification_episodes(

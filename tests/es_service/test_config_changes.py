@@ -71,14 +71,14 @@ def test_another_task_has_its_own_default_options():
     source = MINIMAL | {"task": {"environment": "point_maze", "options": {"start": "corner"}}}
     other = {"tasks": SHIPPED, "algorithms": ALGORITHMS, "rollouts": BACKENDS}
     loaded = load_config(source, ["task.environment=ant_maze"], **other)
-    assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {})
+    assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {"physics": "spring"})
     assert left_out(source, ["task.environment=ant_maze"], **other) == {
         "task.options.start": "ant_maze replaces its task"
     }
     for same in ([], ["task.environment=point_maze"]):
         assert load_config(source, same, **other).task.options == {"start": "corner"}
         assert left_out(source, same, **other) == {}
-    with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has none"):
+    with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has physics"):
         load_config(source, ["task.environment=ant_maze", "task.options.start=corner"], **other)
 
 
