@@ -46,7 +46,7 @@ def test_exports_hold_what_the_run_holds(tmp_path, mapped):
         np.testing.assert_array_equal(arrays["trace"][3], elite.trace_T_B)
     result = command("export", mapped.folder, "--to", "pdf")
     assert result.returncode == 2
-    assert "must be csv, parquet, npz, ribs or tensorboard" in result.stderr
+    assert "must be csv, parquet, npz, onnx, ribs or tensorboard" in result.stderr
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

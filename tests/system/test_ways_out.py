@@ -213,7 +213,7 @@ def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
     flip_bit(folder / "run.db", at + 8)
     refusal = command("digest", folder, "--parts")
     assert (refusal.returncode, refusal.stdout) == (1, "")
-    assert re.search(r"state of '(centre_\d|elite_\d+)' at generation 3 does not match its SHA-256", refusal.stderr)
+    assert re.search(r"state of 'centres/\d' at generation 3 does not match its SHA-256", refusal.stderr)
     assert words_after(refusal.stderr, "resume") == [str(folder)]
     for wanted, refused in (("search.sigma=0.3", True), ("budget.generations=3", False)):
         (folder / "run.db").write_bytes(sound)
