@@ -6,6 +6,7 @@ import shutil
 import subprocess
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from es_service import api
@@ -62,7 +63,7 @@ POLICIES = [
 @pytest.mark.parametrize("clip", [None, 1.5])
 def test_a_model_has_the_actions_of_its_policy(kind, clip):
     """By onnxruntime, for episodes side by side, step by step."""
-    onnxruntime, rng = pytest.importorskip("onnxruntime"), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     values = {"hidden": [8], "activation": "tanh", "output": "tanh", "bias": True, "memory": None, **kind}
     spec = policy_of({f"policy.{name}": value for name, value in values.items()}, 4, 3)
     parameters_D, mean_O = (rng.normal(size=size).astype(np.float32) for size in (spec.parameters, 4))
@@ -80,7 +81,6 @@ def test_a_model_has_the_actions_of_its_policy(kind, clip):
 
 
 def test_exported_models_have_a_card_whose_code_runs(run, tmp_path, monkeypatch):
-    pytest.importorskip("onnxruntime")
     certify_run(run.folder, episodes=8)
     files = {file.name: file for file in export(run, "onnx", tmp_path)}
     assert list(files) == ["certified.onnx", "best.onnx", "centre.onnx", "model_card.md", "SHA256SUMS"]
