@@ -90,6 +90,9 @@ class Asked:
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def __repr__(self) -> str:
+        return f"<{len(self)} episodes: {self.token}, {self.parameters.shape[1]:,} parameters each>"
+
     def act(self, observation: ArrayLike, step: int) -> FloatArray:
         """Actions [N, A] of the policies, each for its own observation, with the action noise of those that train.
 

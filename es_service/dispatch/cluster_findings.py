@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -133,6 +134,21 @@ def _differences(theirs: Software, here: Software) -> Iterator[Finding]:
         yield "note", f"its processor is {cpu}, here {ours['cpu']}; {meaning}; {way_out}"
 
 
+def node_names(nodes: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Id of each living node -> its host and address; nodes that share both have the port of their raylet, too.
+
+    Args:
+        nodes: what `ray.nodes()` returns.
+    """
+    places = {
+        node["NodeID"]: (f"{node['NodeManagerHostname']} {node['NodeManagerAddress']}", node["NodeManagerPort"])
+        for node in nodes
+        if node["Alive"]
+    }
+    shared = Counter(name for name, _ in places.values())
+    return {node: f"{name}:{port}" if shared[name] > 1 else name for node, (name, port) in places.items()}
+
+
 def _ask(ray: ModuleType) -> tuple[dict[str, Software], dict[str, str]]:
     """Name of each node -> its software, or why it gave no answer."""
     affinity = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
@@ -140,11 +156,8 @@ def _ask(ray: ModuleType) -> tuple[dict[str, Software], dict[str, str]]:
     try:
         probe = ray.remote(num_cpus=0, max_retries=0)(node_probe.software)
         asked = {
-            probe.options(scheduling_strategy=affinity(node["NodeID"], soft=False)).remote(): (
-                f"{node['NodeManagerHostname']} {node['NodeManagerAddress']}"
-            )
-            for node in ray.nodes()
-            if node["Alive"]
+            probe.options(scheduling_strategy=affinity(node, soft=False)).remote(): name
+            for node, name in node_names(ray.nodes()).items()
         }
     finally:
         ray.cloudpickle.unregister_pickle_by_value(node_probe)

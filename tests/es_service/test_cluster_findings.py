@@ -14,7 +14,13 @@ import pytest
 
 from es_service.dispatch import cluster_findings as module
 from es_service.dispatch import node_probe
-from es_service.dispatch.cluster_findings import access_findings, answers_anyone, cluster_findings, node_findings
+from es_service.dispatch.cluster_findings import (
+    access_findings,
+    answers_anyone,
+    cluster_findings,
+    node_findings,
+    node_names,
+)
 from es_service.errors import EvaluationError
 from es_service.protocol.machine import VERSION
 
@@ -28,6 +34,17 @@ def said(*, first=HERE, second=HERE, silent=None):
     """What is found of two nodes, but for their number."""
     answers = {"one 10.0.0.1": first, **({} if silent else {"two 10.0.0.2": second})}
     return list(node_findings(answers, {"two 10.0.0.2": silent} if silent else {}, HERE))[1:]
+
+
+def test_nodes_that_share_a_host_are_several():
+    def node(name, host, *, port=1, alive=True):
+        return {
+            "NodeID": name, "NodeManagerHostname": host, "NodeManagerAddress": "10.0.0.1", "NodeManagerPort": port,
+            "Alive": alive,
+        }  # fmt: skip
+
+    nodes = [node("a", "one", port=7), node("b", "one", port=8), node("c", "two"), node("d", "two", alive=False)]
+    assert node_names(nodes) == {"a": "one 10.0.0.1:7", "b": "one 10.0.0.1:8", "c": "two 10.0.0.1"}
 
 
 def test_what_was_checked_is_said_where_nothing_is_wrong():

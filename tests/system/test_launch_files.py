@@ -7,6 +7,8 @@ import copy
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -33,6 +35,7 @@ PARAMETERS = {
     "WHEELS": "/home/me/es-service/build/ray-up",
 }
 KINDS = {"kuberay-rayjob.yaml": "RayJob", "kuberay-raycluster.yaml": "RayCluster"}
+NO_PRIVILEGES = {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}}
 DRAIN = "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"
 
 
@@ -117,6 +120,49 @@ def test_cluster_is_safe_and_hands_work_over(name):
         (container,) = pod["containers"]
         assert container["image"] == PARAMETERS["IMAGE"]
         assert container["resources"]["requests"] == container["resources"]["limits"]
+        assert container["securityContext"] == NO_PRIVILEGES
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert cluster["autoscalerOptions"]["securityContext"] == NO_PRIVILEGES
+
+
+def test_only_rays_pods_and_the_operator_reach_rays_pods():
+    """By the labels of KubeRay 1.7 and its chart, whose schemas have no NetworkPolicy."""
+    policy = load("kuberay-network.yaml")
+    assert (policy["apiVersion"], policy["kind"]) == ("networking.k8s.io/v1", "NetworkPolicy")
+    of_ray = {"matchLabels": {"ray.io/is-ray-node": "yes"}}
+    of_operator = {"matchLabels": {"app.kubernetes.io/name": "kuberay-operator"}}
+    dashboard = {"protocol": "TCP", "port": 8265}
+    assert policy["spec"] == {
+        "podSelector": of_ray,
+        "policyTypes": ["Ingress"],
+        "ingress": [
+            {"from": [{"podSelector": of_ray}]},
+            {"from": [{"namespaceSelector": {}, "podSelector": of_operator}], "ports": [dashboard]},
+        ],
+    }
+
+
+def test_containers_of_compose_are_limited_and_their_token_is_a_file():
+    compose = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+    assert compose["secrets"] == {"token": {"environment": "TOKEN"}}
+    for service in compose["services"].values():
+        assert service["environment"] == {"RAY_AUTH_TOKEN_PATH": "/run/secrets/token"}
+        assert service["secrets"] == ["token"]
+        assert service["restart"] == "unless-stopped"
+        assert service["healthcheck"]["test"][:3] == ["CMD", "ray", "health-check"]
+        assert service["deploy"]["resources"]["limits"]["memory"]
+        assert service["cap_drop"] == ["ALL"]
+
+
+@pytest.mark.parametrize("extras", ["", "cluster,gymnasium"])
+def test_image_has_the_extras_that_are_named(extras):
+    """The program of the Dockerfile that lists what is installed, run here."""
+    (program,) = re.findall(r"python -c '(.*?)' \"", (DOCKER / "Dockerfile").read_text(), flags=re.DOTALL)
+    words = [sys.executable, "-c", program.replace("\\\n", ""), extras]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
+    assert any(line.startswith("jax") for line in listed)
+    for extra, package in (("cluster", "ray[default]"), ("gymnasium", "gymnasium[mujoco]")):
+        assert any(line.startswith(package) for line in listed) == (extra in extras)
 
 
 def test_disk_of_the_runs_has_the_schema_of_a_claim():
@@ -206,7 +252,7 @@ def test_versions_are_those_of_the_image():
     assert {cluster_of(load(name))["rayVersion"] for name in KINDS} == {pinned["ray"]} == {ray.__version__}
 
 
-@pytest.mark.parametrize("name", [*KINDS, "kuberay-runs.yaml", "ray-up.yaml", "slurm.sh"])
+@pytest.mark.parametrize("name", [*KINDS, "kuberay-runs.yaml", "kuberay-network.yaml", "ray-up.yaml", "slurm.sh"])
 def test_guide_shows_every_launch_file(name):
     guide = (DOCKER / "README.md").read_text()
     assert f"]({name})" in guide
