@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.mujoco                                  # all rows, one core: hours with xla
     python -m tests.benchmarks.mujoco --rows brax: --cores 1 2 --without xla
-    python -m tests.benchmarks.mujoco --table                          # what has been measured, for the guide
+    python -m tests.benchmarks.mujoco --table                          # what has been measured, for the guide's tables
 
 A row is a model with its settings. In each of five rounds the sides take turns in one process, whose processor time is
 measured: the compiled control step, C MuJoCo by `mujoco.rollout` with the same settings and with its own (100
@@ -265,6 +265,15 @@ def table(of: Path) -> str:
     return "\n".join(lines)
 
 
+def peers(of: Path) -> str:
+    """The rows of the guide's table of peers: `mujoco.rollout` with its own settings on one core, and ours."""
+    lines = []
+    for row in pd.read_csv(of).query("cores == 1 and not all_pairs and simd == simd").to_dict("records"):
+        times = "**{:.3g}** ({:.3g} to {:.3g})".format(*(row[f"{part}_c_own"] for part in ("times", "least", "most")))
+        lines.append(f"| {row['row']} | {row['c_own']:,.0f} | {row['simd']:,.0f} | {times} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", nargs="+", default=[""], help="only rows that have one of these texts in their names")
@@ -275,11 +284,11 @@ def main() -> None:
         "--playground", type=Path, help="folder that contains mujoco_playground; else the installed one"
     )
     parser.add_argument("--results", type=Path, default=RESULTS, help="the table to which rows are added")
-    parser.add_argument("--table", action="store_true", help="print the table of the guide, and measure nothing")
+    parser.add_argument("--table", action="store_true", help="print the guide's tables, and measure nothing")
     parser.add_argument("--measure", type=json.loads, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.table:
-        print(table(arguments.results))
+        print(table(arguments.results), peers(arguments.results), sep="\n\n")
         return
     if arguments.measure:
         given = arguments.measure
