@@ -71,7 +71,7 @@ class TaskConfig(Section):
     @property
     def code(self) -> tuple[str, ...]:
         """`sources.task_code` of the task."""
-        return task_code(self.environment, self.descriptor)
+        return task_code(self.environment, self.descriptor, self.options)
 
 
 class PolicyConfig(Section):

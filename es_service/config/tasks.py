@@ -95,7 +95,7 @@ class Tasks(Mapping[str, TaskSpec]):
             return environments.SHIPPED[name]
         require_no_import_of_a_task()
         settings = environments.settings_of_description(name, options, descriptor)
-        code = tuple(user_sources(*task_code(name, descriptor)).items())
+        code = tuple(user_sources(*task_code(name, descriptor, options)).items())
 
         def described(settings: Mapping[str, Any]) -> TaskSpec:
             return _described(name, json.dumps(settings, sort_keys=True), code)

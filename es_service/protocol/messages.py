@@ -157,7 +157,7 @@ class WorkerSpec:
     @property
     def task_code(self) -> tuple[str, ...]:
         """`sources.task_code` of its task."""
-        return task_code(self.environment, self.descriptor)
+        return task_code(self.environment, self.descriptor, self.environment_options)
 
 
 class WorkerPlace(NamedTuple):

@@ -41,7 +41,8 @@ SUITES = ("gymnax", "playground")
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
 MODELS, MODEL_FILES = "mujoco", "envs/mujoco/assets"
-"""Kind of the tasks whose models are files of this library, and the folder of its package that contains them."""
+"""Kind of the tasks whose models are files of this library, also as the value of our tasks' option `physics`; and the
+folder of its package that contains them."""
 OUR_NAMESPACE, OUR_ENVIRONMENTS = "es_service", "es_service.gymnasium"
 """Gymnasium's namespace of our tasks, and the module that registers them."""
 NAMED = 5
@@ -50,9 +51,12 @@ SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
 
-def task_code(environment: str, descriptor: object) -> tuple[str, ...]:
-    """What a task's config says that may name code of a user: the task, and a descriptor that is `module:function`."""
-    return (environment, descriptor) if isinstance(descriptor, str) and ":" in descriptor else (environment,)
+def task_code(environment: str, descriptor: object, options: Mapping[str, object]) -> tuple[str, ...]:
+    """What a task's config says that names files that are none of ours: the task, a descriptor that is
+    `module:function`, and `mujoco:` if the options choose a model of MuJoCo for one of our tasks."""
+    named = isinstance(descriptor, str) and ":" in descriptor
+    modelled = ":" not in environment and options.get("physics") == MODELS
+    return (environment, *((str(descriptor),) if named else ()), *((f"{MODELS}:",) if modelled else ()))
 
 
 def worker_sources(*names: str) -> dict[str, str]:

@@ -49,7 +49,7 @@ def replay_section(
     if certified:
         run.policy("certified")
     task, search = run.present_config["task"], run.present_config["search"]
-    names = (*task_code(task["environment"], task.get("descriptor")), search["algorithm"])
+    names = (*task_code(task["environment"], task.get("descriptor"), task.get("options", {})), search["algorithm"])
     if not trusted and (code := [name for name in names if user_path(name)]):
         return _no_replay(
             f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import pickle
 import shutil
@@ -9,14 +10,18 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from es_service.api import load_config
+from es_service.config.tasks import task_of
+from es_service.config.workload import worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import EvaluationError
-from es_service.protocol.machine import CODE, is_mixed
+from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.machine import CODE, is_mixed, platform_info
 from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.sources import (
     OtherCodeError,
@@ -28,7 +33,7 @@ from es_service.protocol.sources import (
     worker_sources,
 )
 from es_service.protocol.system import architecture
-from es_service.runs.identity import code_of
+from es_service.runs.identity import code_of, require_unchanged, tell_of_other_code
 from tests.helpers import SPEC, centre, random_parameters
 from workers.actor import WorkerActor
 
@@ -139,7 +144,7 @@ def test_a_user_s_modules_count_with_what_they_import_from_the_same_place(own):
 
 def test_a_descriptor_that_is_a_user_s_function_is_code_of_the_task(own):
     name = "gymnasium:Pendulum-v1"
-    assert task_code(name, None) == task_code(name, "angle") == task_code(name, (0, 1)) == (name,)
+    assert task_code(name, None, {}) == task_code(name, "angle", {}) == task_code(name, (0, 1), {}) == (name,)
     task, without_map = {"environment": name}, {"enabled": False}
     config = load_config(
         {"task": task, "search": {"algorithm": "es"}, "map": without_map, "budget": {"generations": 1}}
@@ -148,6 +153,33 @@ def test_a_descriptor_that_is_a_user_s_function_is_code_of_the_task(own):
     code = code_of(config.model_copy(update={"task": described}))
     assert set(other_files(code_of(config), code)) == {"my_task.py", "my_physics.py", "my_constants.py"}
     assert "my_task.py" in other_files(worker_sources(name), worker_sources(*described.code))
+
+
+def test_the_model_file_of_an_ant_in_mujoco_is_code_of_the_run(tmp_path, monkeypatch):
+    """Another version of Gymnasium's package has another `ant.xml`: a worker with it is refused, and a resume tells."""
+    assets = Path("gymnasium/envs/mujoco/assets")
+    installed = Path(*importlib.import_module("gymnasium").__path__).parent / assets
+    shutil.copytree(installed, tmp_path / assets)
+    (tmp_path / "gymnasium/__init__.py").touch()
+    given = {"task": {"environment": "ant_trap"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+    spring, mujoco = (load_config(given, [f"task.options.physics={physics}"]) for physics in ("spring", "mujoco"))
+    before = code_of(mujoco)
+    assert f"{assets}/ant.xml" in other_files(before, code_of(spring))
+    spec = worker_spec(mujoco, task_of(mujoco))
+    monkeypatch.delitem(sys.modules, "gymnasium")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert code_of(mujoco) == before, "its place does not count"
+    (tmp_path / assets / "ant.xml").write_text("<mujoco/>")
+    assert "has other code" in why_refused(spec.sources, spec.task_code)
+    assert f"{assets}/ant.xml." in why_refused(spec.sources, spec.task_code)
+    then = {**platform_info(), CODE: before}
+    store: Any = SimpleNamespace(generation=4, platform_before=lambda generation: then, folder=tmp_path)
+    told: list[str] = []
+    tell_of_other_code(store, code_of(mujoco), told.append)
+    assert told[0].startswith("from generation 5 on, this run is computed with other code: ")
+    assert f": {assets}/ant.xml changed. " in told[0]
+    with pytest.raises(ConfigError, match=r"strict was asked for.* computed: [^ ]*/ant\.xml\n"):
+        require_unchanged(store, mujoco)
 
 
 @pytest.mark.parametrize("name", ["brax:ant", "no_such_module:Class", "sys:path", "rich.table:Table", "json:loads"])
