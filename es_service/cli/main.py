@@ -1,5 +1,5 @@
 """The command line: `es-service run | resume | fork | polish | sweep | status | watch | digest | config | list |
-evaluate | export | report | verify | submit | jobs | logs | stop | bench | doctor`.
+evaluate | export | report | verify | submit | jobs | logs | stop | bench | doctor | help`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 3 cannot be checked now (`verify` of a running run), 130 or 143
 interrupted by SIGINT or SIGTERM.
@@ -23,6 +23,7 @@ from es_service import api
 from es_service.cli.bench import bench
 from es_service.cli.console import console, print_line
 from es_service.cli.evaluate import evaluate
+from es_service.cli.guides import help_
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
     AddressOption,
@@ -150,6 +151,7 @@ app.command()(status)
 app.command(name="digest")(digest_)
 app.command(name="config")(config_)
 app.command(name="list")(list_)
+app.command(name="help")(help_)
 
 
 app.command()(evaluate)
