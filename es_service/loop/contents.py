@@ -5,7 +5,7 @@ Axes: N evaluated centres and policies, T points of a trace, B descriptor dimens
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import EvaluationError, StoreError
-from es_service.loop.evaluated import Evaluated
+from es_service.loop.policies import PolicyWork
 from es_service.protocol.content import NAME, Arrays, as_bytes, name_of, names, policy_content
 from es_service.protocol.kept import Kept
+from es_service.protocol.messages import Centre
 from es_service.protocol.policy_spec import PolicySpec
-from es_service.protocol.recipes import Recipes, unvaried
+from es_service.protocol.recipes import Recipes, remember, unvaried
 from es_service.search.algorithms.base import PolicyAsk
 from es_service.search.arrays import freeze
 from es_service.search.maps.behaviour_map import NO_TRACE, Elite
@@ -29,8 +30,11 @@ RECENT_BYTES = 256 * 2**20
 class Named:
     """The policies that a generation has evaluated, and their traces, which get names when something needs them."""
 
-    def __init__(self, evaluated: Evaluated, spec: PolicySpec) -> None:
-        self._evaluated, self._spec = evaluated, spec
+    def __init__(
+        self, subjects: Sequence[Centre | PolicyWork], trace_N_T_B: NDArray[np.float32] | None, spec: PolicySpec
+    ) -> None:
+        """Name nothing yet; `subjects`: centres and asks for policies, which together are the N."""
+        self._subjects, self._trace_N_T_B, self._spec = subjects, trace_N_T_B, spec
         self._known: dict[int, tuple[bytes, bytes]] = {}
         self.contents: dict[bytes, Arrays] = {}
         """Those that have a name."""
@@ -38,14 +42,32 @@ class Named:
     def names(self, rows: Sequence[int]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Names of the policies of some rows, and of their traces."""
         new = [row for row in dict.fromkeys(rows) if row not in self._known]
-        for row, point in zip(new, self._evaluated.points(new), strict=True):
+        for row, point in self.points(new).items():
             statistics = point.observation_mean_O, point.observation_std_O
-            trace_N_T_B = self._evaluated.evaluation.trace_T_B
-            assert trace_N_T_B is not None, "an evaluation has a trace"
+            assert self._trace_N_T_B is not None, "an evaluation has a trace"
             policy = policy_content(self._spec, point.parameters_D, *statistics)
-            self._known[row] = self._add(policy), self._add({"trace_T_B": trace_N_T_B[row].copy()})
-        self._evaluated.remember(new, [self._known[row][0] for row in new])
+            self._known[row] = self._add(policy), self._add({"trace_T_B": self._trace_N_T_B[row].copy()})
+        for work, numbers, rows_here in self._of_subjects(new):
+            if isinstance(work, PolicyWork) and isinstance(work.parameters_N_D, Recipes):
+                remember(work.parameters_N_D.part(numbers), [self._known[row][0] for row in rows_here])
         return names(self._known[row][0] for row in rows), names(self._known[row][1] for row in rows)
+
+    def points(self, rows: Sequence[int]) -> dict[int, Centre]:
+        """What was evaluated, by row, with its observation statistics, in arrays that are not parts of others."""
+        points: dict[int, Centre] = {}
+        for subject, numbers, here in self._of_subjects(rows):
+            policies = [subject] if isinstance(subject, Centre) else subject.policies(numbers)
+            points |= zip(here, policies, strict=True)
+        return points
+
+    def _of_subjects(self, rows: Sequence[int]) -> Iterator[tuple[Centre | PolicyWork, list[int], list[int]]]:
+        """(a centre or an ask for policies, numbers of its policies, their rows), of those that have some of `rows`."""
+        first = 0
+        for subject in self._subjects:
+            end = first + (1 if isinstance(subject, Centre) else len(subject.parameters_N_D))
+            if here := [row for row in rows if first <= row < end]:
+                yield subject, [row - first for row in here], here
+            first = end
 
     def _add(self, content: Arrays) -> bytes:
         freeze(content.values())

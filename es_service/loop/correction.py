@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from es_service.loop.checks import valid_members
-from es_service.loop.evaluated import Update
 from es_service.loop.generation import episodes_of, steps_of
 from es_service.loop.history import CORRECTED, HistoryRow, doubles
 from es_service.loop.interfaces import Search
@@ -24,7 +23,7 @@ from es_service.loop.policies import policy_work
 from es_service.protocol.evaluator import Requests
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain
-from es_service.search.algorithms.base import PolicyAsk
+from es_service.search.algorithms.base import PolicyAsk, SearchState
 from es_service.search.maps.batches import insert_each
 from es_service.search.maps.behaviour_map import empty_map, map_statistics
 
@@ -42,17 +41,18 @@ class Correction:
     episodes: int = 0
 
 
-def correct(search: Search, policies: Callable[[PolicyAsk], PolicyAsk], updated: Update) -> Requests[Correction]:
+def correct(
+    search: Search, policies: Callable[[PolicyAsk], PolicyAsk], learned: SearchState, generation: int
+) -> Requests[Correction]:
     """The corrected columns of a generation; without values where it does not correct, and none if no generation does.
 
     Args:
         policies: returns policies that are asked for by name, with their parameters and statistics.
-        updated: what the generation has changed.
+        learned: the search's state after it was told the evaluations of the generation.
     """
-    settings, map_ = search.config.map, updated.search.map
+    settings, map_ = search.config.map, learned.map
     if settings.correct_every is None or map_ is None:
         return Correction()
-    generation = updated.told.generation
     if generation % settings.correct_every or not map_.size:
         return Correction(dict.fromkeys(CORRECTED))
     again, steps, episodes = empty_map(map_.geometry), 0, 0

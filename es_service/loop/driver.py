@@ -9,7 +9,7 @@ step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -33,16 +33,8 @@ from es_service.loop.checks import (
 from es_service.loop.clock import Clock
 from es_service.loop.contents import Contents, Named
 from es_service.loop.correction import correct
-from es_service.loop.evaluated import (
-    Evaluations,
-    Proposal,
-    Update,
-    in_ask_order,
-    initial_centres,
-    policies_asked,
-    told_of,
-)
-from es_service.loop.finished import Finished, finish, reachable_in, rows
+from es_service.loop.evaluated import policies_asked, told_of_asks, told_of_initial
+from es_service.loop.finished import Finished, Members, finish, reachable_in, rows
 from es_service.loop.generation import (
     estimate_gradients,
     evaluate_centres,
@@ -57,8 +49,8 @@ from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.policies import as_population
 from es_service.loop.state import RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator, Requests, Session, Value
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray
-from es_service.search.algorithms.base import Ask, SearchState
+from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.novelty import novelty
 
 
@@ -197,15 +189,20 @@ def generation(
         state: the state before it.
         counts: as in `run`.
     """
-    since = counts() if state.generation >= 0 else DispatchCounts()
-    proposal = propose(search, policies, state)
+    since, number = counts() if state.generation >= 0 else DispatchCounts(), state.generation + 1
+    if number == 0:
+        start_cells, members, stepped = {}, Members(), state.search
+        told, named = yield from _initial(search, state, clock)
+        novelty_N = np.full(len(told), np.nan)
+    else:
+        begun, start_cells, asked = propose(search, policies, state)
+        clock.lap("seconds_driver")
+        members, stepped, (told, named) = yield from _asked(search, state, begun, asked, clock)
+        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(search.config.novelty))
+    learned = tell(search.algorithm, stepped, told)
+    policies.add(named.contents)
     clock.lap("seconds_driver")
-    evaluations = yield from evaluate(search, proposal)
-    clock.lap("seconds_rollout")
-    updated = yield from update(search, proposal, evaluations, clock)
-    policies.add(updated.contents)
-    clock.lap("seconds_driver")
-    correction = yield from correct(search, policies.policies, updated)
+    correction = yield from correct(search, policies.policies, learned, number)
     clock.lap("seconds_evaluation")
     now = counts()
     faults: HistoryRow = {
@@ -213,30 +210,24 @@ def generation(
         "lost_workers": now.lost_workers - since.lost_workers,
         "workers": now.workers,
     }
-    return finish(state, proposal, evaluations, updated, correction, faults, search, clock)
+    computed = start_cells, members, told, named, novelty_N
+    return finish(state, learned, *computed, correction, faults, search, clock)
 
 
-def propose(search: Search, policies: Contents, state: RunState) -> Proposal:
-    """What the next generation evaluates: centres restart from elites, and the search asks."""
-    config, algorithm, generation = search.config, search.algorithm, state.generation + 1
-    begun = state.search
-    if generation == 0:
-        points = [make_centre(config, 0, centre.centre_D, state.observations, centre) for centre in begun.centres]
-        return Proposal(0, begun, {}, (), points, ())
+def propose(
+    search: Search, policies: Contents, state: RunState
+) -> tuple[SearchState, Mapping[int, int], Sequence[Ask | PolicyAsk]]:
+    """What the next generation asks for: (the state in which centres have restarted from elites, the cells of these
+    elites by index of the centre, the asks)."""
+    algorithm, begun, number = search.algorithm, state.search, state.generation + 1
     size = begun.centres[0].centre_D.size
-    start_cells = require_start_cells(algorithm.start_cells(begun, generation), begun, generation)
+    start_cells = require_start_cells(algorithm.start_cells(begun, number), begun, number)
     for index, cell in start_cells.items():
         begun = algorithm.restart(begun, index, cell, policies.elite(_policy_of(begun, cell)))
-        require_state(begun, "restart", generation, index, size)
-    asked: Any = policies.completed(algorithm.ask(begun, generation), generation)
-    require_asks(asked, begun, config.compute.chunk_pairs, search.task.observation_size, generation)
-    points = [
-        make_centre(config, generation, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
-        for ask in asked
-        if isinstance(ask, Ask)
-    ]
-    work = policies_asked(config, search.task, generation, asked)
-    return Proposal(generation, begun, start_cells, asked, points, work)
+        require_state(begun, "restart", number, index, size)
+    asked: Any = policies.completed(algorithm.ask(begun, number), number)
+    require_asks(asked, begun, search.config.compute.chunk_pairs, search.task.observation_size, number)
+    return begun, start_cells, asked
 
 
 def _policy_of(state: SearchState, cell: int) -> bytes:
@@ -245,77 +236,83 @@ def _policy_of(state: SearchState, cell: int) -> bytes:
     return state.map.policy_N[state.map.row_of(cell)].tobytes()
 
 
-def evaluate(search: Search, proposal: Proposal) -> Requests[Evaluations]:
-    """Roll out the populations and the policies."""
-    config, asks = search.config, proposal.asks
-    if not proposal.asked:
-        return Evaluations((), (), (), ())
-    pairs = [ask.pairs for ask in asks]
-    populations, observed, policies = yield from evaluate_populations(
-        proposal.centres, pairs, config.compute.chunk_pairs, proposal.policies
-    )
-    members = [*populations, *map(as_population, policies)]
-    members, infeasible = invalidate(members, config.search, proposal.generation)
-    return Evaluations(members[: len(asks)], policies, members, observed, infeasible)
-
-
-def update(search: Search, proposal: Proposal, evaluations: Evaluations, clock: Clock) -> Requests[Update]:
-    """Weigh the noise, estimate gradients, step, evaluate the new centres, and tell the search."""
-    config, algorithm, generation = search.config, search.algorithm, proposal.generation
-    stepped, new_centres = proposal.search, proposal.centres
-    if proposal.asked:
-        stepped, new_centres = yield from _step(search, proposal, evaluations.populations, clock)
-    resets = "by_ask" if proposal.asked else "by_chunk"
-    results = yield from evaluate_centres(new_centres, config.search.evaluation_episodes, resets=resets)
-    clock.lap("seconds_evaluation")
-    if not proposal.asked:
-        allow_infeasible = config.search.allow_infeasible
-        require_some_finite(results, config.task.environment, allow_infeasible=allow_infeasible)
-        evaluated = initial_centres(new_centres, results, config, stepped.weight.value)
-    else:
-        evaluated = in_ask_order(
-            proposal.asked,
-            zip(new_centres, results, evaluations.populations, strict=True),
-            zip(proposal.policies, evaluations.policies, strict=True),
-            seed=config.seed,
-            centres=len(proposal.search.centres),
-            fitness_weight=proposal.search.weight.value,
-        )
-    named = Named(evaluated, policy_spec(config, search.task))
-    told = told_of(evaluated, generation, named.names)
-    learned = tell(algorithm, stepped, told)
-    novelty_N = np.full(len(told), np.nan)
-    if proposal.asked:
-        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(config.novelty))
-    return Update(learned, evaluated, told, novelty_N, named.contents)
-
-
-def _step(
-    search: Search, proposal: Proposal, populations: Sequence[EpisodesResult], clock: Clock
-) -> Requests[tuple[SearchState, list[Centre]]]:
-    """The state after the step of each centre, and the new centres as they are sent to the workers."""
-    config, algorithm, generation, asks = search.config, search.algorithm, proposal.generation, proposal.asks
-    weights: list[FloatArray] = []
-    for ask, population in zip(asks, populations, strict=True):
-        weights.append(algorithm.weights(proposal.search, ask, population))
-        require_weights(weights[-1], ask, generation)
+def _initial(search: Search, state: RunState, clock: Clock) -> Requests[tuple[CentreEvaluations, Named]]:
+    """Evaluate the initial centres, around which there are no populations."""
+    config = search.config
+    centres = [make_centre(config, 0, centre.centre_D, state.observations, centre) for centre in state.search.centres]
     clock.lap("seconds_driver")
-    block_pairs = config.compute.gradient_block_pairs
-    if isinstance(config.search, PopulationConfig) and config.search.step_gate:
-        gradients, agreements = yield from halves(generation, weights, block_pairs)
-        asks = [replace(ask, rate=ask.rate * agreement) for ask, agreement in zip(asks, agreements, strict=True)]
-    else:
-        gradients = yield from estimate_gradients(generation, weights, block_pairs)
-    clock.lap("seconds_gradient")
-    stepped = proposal.search
-    for ask, gradient_D in zip(asks, gradients, strict=True):
-        stepped = algorithm.step(stepped, ask, gradient_D)
-        require_state(stepped, "step", generation, ask.centre, gradient_D.size)
+    results = yield from evaluate_centres(centres, config.search.evaluation_episodes, resets="by_chunk")
+    clock.lap("seconds_evaluation")
+    require_some_finite(results, config.task.environment, allow_infeasible=config.search.allow_infeasible)
+    return told_of_initial(centres, results, config, state.search.weight.value, policy_spec(config, search.task))
+
+
+def _asked(
+    search: Search, state: RunState, begun: SearchState, asked: Sequence[Ask | PolicyAsk], clock: Clock
+) -> Requests[tuple[Members, SearchState, tuple[CentreEvaluations, Named]]]:
+    """Roll out what was asked for, step, and evaluate the new centres: (the members, the state after the steps, what
+    the search is told)."""
+    config, number = search.config, state.generation + 1
+    asks = [ask for ask in asked if isinstance(ask, Ask)]
+    centres = [
+        make_centre(config, number, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
+        for ask in asks
+    ]
+    policies = policies_asked(config, search.task, number, asked)
+    pairs = [ask.pairs for ask in asks]
+    results, observed, of_policies = yield from evaluate_populations(
+        centres, pairs, config.compute.chunk_pairs, policies
+    )
+    clock.lap("seconds_rollout")
+    valid, infeasible = invalidate([*results, *map(as_population, of_policies)], config.search, number)
+    populations = valid[: len(asks)]
+    gradients = yield from _gradients(search, begun, asks, populations, number, clock)
+    stepped = begun
+    for ask, gradient_D in gradients:
+        stepped = search.algorithm.step(stepped, ask, gradient_D)
+        require_state(stepped, "step", number, ask.centre, gradient_D.size)
     # New centres are evaluated with the observation statistics of the generation's start.
     new_centres = [
         replace(centre, parameters_D=stepped.centres[ask.centre].centre_D)
-        for ask, centre in zip(asks, proposal.centres, strict=True)
+        for ask, centre in zip(asks, centres, strict=True)
     ]
-    require_finite(new_centres, config.search, generation)
+    require_finite(new_centres, config.search, number)
     clock.lap("seconds_driver")
-    return stepped, new_centres
+    evaluations = yield from evaluate_centres(new_centres, config.search.evaluation_episodes)
+    clock.lap("seconds_evaluation")
+    told = told_of_asks(
+        number,
+        asked,
+        zip(new_centres, evaluations, populations, strict=True),
+        zip(policies, of_policies, strict=True),
+        seed=config.seed,
+        centres=len(begun.centres),
+        fitness_weight=begun.weight.value,
+        spec=policy_spec(config, search.task),
+    )
+    return Members(valid, observed, infeasible, 2 * sum(pairs)), stepped, told
+
+
+def _gradients(
+    search: Search,
+    begun: SearchState,
+    asks: Sequence[Ask],
+    populations: Sequence[EpisodesResult],
+    number: int,
+    clock: Clock,
+) -> Requests[list[tuple[Ask, FloatArray]]]:
+    """Weigh the noise of each population, and estimate its gradient [D]."""
+    config = search.config
+    weights: list[FloatArray] = []
+    for ask, population in zip(asks, populations, strict=True):
+        weights.append(search.algorithm.weights(begun, ask, population))
+        require_weights(weights[-1], ask, number)
+    clock.lap("seconds_driver")
+    block_pairs = config.compute.gradient_block_pairs
+    if isinstance(config.search, PopulationConfig) and config.search.step_gate:
+        gradients, agreements = yield from halves(number, weights, block_pairs)
+        asks = [replace(ask, rate=ask.rate * agreement) for ask, agreement in zip(asks, agreements, strict=True)]
+    else:
+        gradients = yield from estimate_gradients(number, weights, block_pairs)
+    clock.lap("seconds_gradient")
+    return list(zip(asks, gradients, strict=True))

@@ -241,6 +241,12 @@ def better(best: Best, told: CentreEvaluations) -> Best:
     return Best(told.generation, float(told.fitness_N[at]) if is_better else -math.inf, policy_N[0])
 
 
+def results_in(told: CentreEvaluations) -> EpisodesResult:
+    """The episodes of what the loop has evaluated, [N, E]."""
+    assert told.results is not None, "the loop has the results of all episodes"
+    return told.results
+
+
 def steps_of(result: EpisodesResult) -> int:
     """Total number of environment steps of episodes."""
     return int(result.steps.sum(dtype=np.int64))

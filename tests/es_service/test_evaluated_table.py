@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from es_service.loop.evaluated import Evaluated, told_of
+from es_service.loop.evaluated import told_of_asks
 from es_service.loop.history import episodes_table, evaluation_columns
-from es_service.protocol.messages import Centre, EpisodesResult, TaskSpec
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.messages import EpisodesResult, PolicySpec, TaskSpec
+from es_service.search.algorithms.base import PolicyAsk
 
 TASK = TaskSpec("maze", 2, 2, 200, ("x", "y"), ((-1.0, 1.0),) * 2, False, True)
 LAYOUTS = {
@@ -60,9 +62,11 @@ def bits(values):
 def test_columns_have_the_bits_of_each_centre_alone(centres, layout, episodes):
     result = results(centres, episodes, layout)
     table = episodes_table(result, TASK)
-    none, index = np.full(centres, np.nan), np.arange(centres)
-    point = Centre(3, np.zeros(1, np.float32), 0.0, *np.zeros((2, 2), np.float32))
-    told = told_of(Evaluated([point], index, result, index[:, None], none, none, none, index), 3)
+    work = policy_work(np.zeros((centres, 1), np.float32), no_statistics(centres, 2), episodes, seed=0, generation=3)
+    asks = [PolicyAsk(work.parameters_N_D)]
+    told, _ = told_of_asks(
+        3, asks, [], [(work, result)], seed=0, centres=0, fitness_weight=1.0, spec=PolicySpec((2, 2))
+    )
     for row in range(centres):
         expected = alone(result, row)
         assert table.keys() == expected.keys()

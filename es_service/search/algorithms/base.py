@@ -196,6 +196,8 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
     names: Callable[[Sequence[int]], tuple[NDArray[Any], NDArray[Any]]] | None = None
     """Function from indices on axis N to the names of the policies that were evaluated, and of their traces. What a
     state names is stored."""
+    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """What else the run's table of evaluated centres has of each, [N], by the name of the column."""
 
     def __len__(self) -> int:
         return len(self.centre_N)
