@@ -1,4 +1,4 @@
-"""The main loop of a run. A generation is: propose, evaluate, update, finish.
+"""The main loop of a run. A generation is: propose, roll out, step, evaluate, tell, finish.
 
 The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. A
 generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed. It is a

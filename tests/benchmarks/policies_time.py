@@ -50,7 +50,7 @@ from workers.parents import Parents
 from workers.rollouts import BACKENDS
 
 FILLING = 50
-ITEMS = ("propose", "evaluate", "update", "finish", "rows", "commit")
+ITEMS = ("propose", "policies_asked", "told_of_asks", "tell", "finish", "rows", "commit")
 MESSAGES = ("send", "read", "arguments", "function", "results", "rest", "answer", "hear")
 """The driver makes messages; workers read them and make new parents, prepare their kernel, make policies and roll them
 out, prepare the results, and do the rest; they answer, and the driver reads that."""
@@ -141,9 +141,9 @@ def _read(frames: Sequence[bytes], parents: Parents) -> list[Work]:
 def timed(function: Callable[..., Any], spent: dict[str, float], name: str) -> Callable[..., Any]:
     """The function, whose time on the processor is added to `spent`, without that of others of these in it."""
 
-    def run(*arguments: Any) -> Any:
+    def run(*arguments: Any, **named: Any) -> Any:
         inside, started = sum(spent.values()), time.process_time()
-        result = function(*arguments)
+        result = function(*arguments, **named)
         inside = sum(spent.values()) - inside
         spent[name] = spent.get(name, 0.0) + time.process_time() - started - inside
         return result
