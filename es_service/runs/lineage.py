@@ -38,6 +38,7 @@ from es_service.runs.snapshot import Policy, Snapshot, make_policy
 from es_service.runs.view import Run, named_best, named_by_all, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreState, FitnessWeight, SearchState
+from es_service.search.algorithms.measured import without_scores
 from es_service.search.algorithms.starts import elite_novelty
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.novelty import sound_archive
@@ -118,7 +119,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS)):
         state = _without_fitness(state)
     elif changed.intersection(SCORE_KEYS):
-        state = _without_scores(state)
+        # The highest fitness of a population is not comparable with that of a population of another size, or with
+        # another noise in its fitness.
+        state = replace(state, search=without_scores(state.search))
     search, algorithm = state.search, ALGORITHMS[config.search.algorithm](config)
     if "search.algorithm" in changed:
         search = replace(search, weight=FitnessWeight(algorithm.fitness_weight))
@@ -152,15 +155,6 @@ def _without_fitness(state: RunState) -> RunState:
         map_ = empty_map(map_.geometry, counts_samples=map_.samples_N is not None)
     search = replace(search, map=map_, weight=FitnessWeight(search.weight.value))
     return replace(state, search=search, best=replace(state.best, fitness=-math.inf))
-
-
-def _without_scores(state: RunState) -> RunState:
-    """A state without the elites' scores: the highest fitness of a population is not comparable with that of a
-    population of another size, or with another noise in its fitness."""
-    map_ = state.search.map
-    if map_ is None:
-        return state
-    return replace(state, search=replace(state.search, map=replace(map_, score_N=np.full(map_.size, np.nan))))
 
 
 def _with_centres(search: SearchState, change: Callable[[CentreState], CentreState]) -> SearchState:

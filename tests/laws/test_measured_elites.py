@@ -13,6 +13,7 @@ from es_service.loop.arrays import joined
 from es_service.protocol.content import as_bytes
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
+from es_service.runs.lineage import fork_config, forked
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.map_elites import PARENT_CHOICE
 from es_service.search.algorithms.measured import (
@@ -232,6 +233,19 @@ def test_after_a_fork_that_emptied_the_map_nothing_is_kept():
     assert len(asked) == 1
     parents = {parent.tobytes() for parent in asked[0].parameters_N_D.parents}
     assert parents <= {centre.centre_D.tobytes() for centre in state.search.centres}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("workers_here")
+def test_after_a_fork_with_other_populations_no_policy_has_a_score(tmp_path):
+    """The highest fitness of a population says nothing of one with another sigma."""
+    config = centres_config("memes", pairs=16, evaluation_episodes=2)
+    run = api.run(config, tmp_path / "run", progress=False).run
+    for name, value, remain in (("map.correct_every", 9, True), ("search.sigma", 0.1, False)):
+        config = fork_config(run.folder, {name: value, "budget.generations": 14})
+        nodes = joined(forked(run, config, None)[1].parts)
+        for scores in (nodes["extra/kept"]["score_K"], nodes["map"]["score_N"]):
+            assert np.isfinite(scores).any() == remain
 
 
 def test_only_what_is_measured_again_counts_samples_and_keeps_policies():

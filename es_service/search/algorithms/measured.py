@@ -79,6 +79,17 @@ def kept_of(state: SearchState) -> KeptPolicies:
     return kept if state.map is not None and state.map.size else at_rows(kept, NONE)
 
 
+def without_scores(state: SearchState) -> SearchState:
+    """The state in which no elite has a score, and no kept policy, as after a fork whose populations are others."""
+    if state.map is None:
+        return state
+    extra = state.extra
+    if KEPT in extra:
+        unknown = np.full(extra[KEPT]["score_K"].shape, np.nan)
+        extra = read_only({**extra, KEPT: {**extra[KEPT], "score_K": unknown}})
+    return replace(state, map=replace(state.map, score_N=np.full(state.map.size, np.nan)), extra=extra)
+
+
 def drawn_rows(config: RunConfig, settings: Measured, kept: KeptPolicies, generation: int, episodes: int) -> NDArray:
     """Indices of the kept policies that a generation measures again.
 
