@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-import numpy as np
 from numpy.typing import NDArray
 from pydantic import create_model
 
@@ -62,11 +61,12 @@ class Elsewhere:
         """How much higher each mean and the share of successes are than `here`, with intervals, by column name; None
         for what one of the tasks does not have."""
         columns: dict[str, float | None] = {}
-        for name in ("return", "last_reward", "goal_distance", "success"):
-            pair = [getattr(episodes, f"{name}_E") for episodes in (here, self.episodes)]
-            has_it = not any(values_E is None or np.isnan(values_E).all() for values_E in pair)
+        there = self.episodes.measures
+        for name, here_E in here.measures.items():
             interval_of = share_gap_interval if name == "success" else gap_interval
-            columns |= interval_columns(f"gap_{name}", interval_of(*pair, paired=self.paired) if has_it else None)
+            lacks = here_E is None or there[name] is None
+            gap = None if lacks else interval_of(here_E, there[name], paired=self.paired)
+            columns |= interval_columns(f"gap_{name}", gap)
         return columns
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,12 +66,23 @@ class Episodes:
         with np.errstate(invalid="ignore", over="ignore"):
             return float(self.fitness(kind).mean())
 
+    @property
+    def measures(self) -> dict[Measure, NDArray[Any] | None]:
+        """What each episode has of each measure, [E]; None for what the task does not have."""
+        has_goal = not np.isnan(self.goal_distance_E).all()
+        return {
+            "return": self.return_E,
+            "last_reward": self.last_reward_E,
+            "goal_distance": self.goal_distance_E if has_goal else None,
+            "success": self.success_E,
+        }
+
     def values(self) -> dict[str, float | int | None]:
         """Means with their intervals, and successes, by column name; None for what the task does not have."""
         columns: dict[str, float | int | None] = {}
-        for name, values_E in (("return", self.return_E), ("last_reward", self.last_reward_E)):
-            columns |= _interval(name, values_E)
-        columns |= _interval("goal_distance", None if np.isnan(self.goal_distance_E).all() else self.goal_distance_E)
+        for name, values_E in self.measures.items():
+            if name != "success":
+                columns |= interval_columns(name, None if values_E is None else mean_interval(values_E))
         successes = None if self.success_E is None else int(self.success_E.sum())
         low, high = (None, None) if successes is None else share_interval(successes, self.count)
         return columns | {"successes": successes, "success_low": low, "success_high": high}
@@ -171,10 +182,6 @@ def kept(result: EpisodesResult) -> Episodes:
         result.steps.astype(np.int64),
         result.descriptor.astype(np.float64),
     )
-
-
-def _interval(name: str, values_E: NDArray[np.float64] | None) -> dict[str, float | None]:
-    return interval_columns(name, None if values_E is None else mean_interval(values_E))
 
 
 def interval_columns(name: str, interval: tuple[float, float, float] | None) -> dict[str, float | None]:

@@ -19,15 +19,22 @@ from es_service.loop.policies import policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, seed_for
-from es_service.report.facts import number
+from es_service.report.facts import elsewhere_text, number
 from es_service.runs import certification, verification
 from es_service.runs.certification import certify_run
-from es_service.runs.certified import all_certifications, certified_elsewhere, certified_policies
+from es_service.runs.certified import (
+    Certified,
+    Elsewhere,
+    all_certifications,
+    certified_elsewhere,
+    certified_policies,
+)
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.intervals import gap_interval, mean_interval, share_gap_interval
 from es_service.runs.onnx import model_card
 from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
+from es_service.runs.selection import Episodes
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.watch.metrics import metrics
@@ -284,6 +291,20 @@ def test_intervals_of_gaps_are_those_of_the_tables():
     freedom = (4 / 3 + 1 / 3) ** 2 / ((4 / 3) ** 2 / 2 + (1 / 3) ** 2 / 2)
     assert freedom == pytest.approx(2.9412, abs=1e-4)
     assert wide == pytest.approx((0.0, -4.1547, 4.1547), abs=1e-3)
+
+
+def test_a_policy_that_is_invalid_in_all_episodes_of_another_task_has_no_numbers_there_and_is_shown(finished):
+    def episodes(value):
+        ones = np.ones(4)
+        return Episodes(value * ones, value * ones, np.nan * ones, None, ones.astype(np.int64), ones[:, None])
+
+    there, arrays = Elsewhere("point_maze", {}, None, "xla", True, episodes(np.nan)), [np.zeros(1, np.float32)] * 3
+    policy = Certified(0, 0, "best", 1, 1.0, "return", 1.0, 16, 2, 3, False, 0, {}, episodes(1.0), *arrays, there)
+    row = policy.row()
+    assert np.isnan([row["elsewhere_return_mean"], row["gap_return_mean"], row["gap_last_reward_low"]]).all()
+    assert row["gap_goal_distance_mean"] is None
+    assert "a gap of none" in elsewhere_text(policy, "return")
+    assert "a gap of nan" in model_card(open_run(finished.folder), ["best.onnx"], policy)
 
 
 def test_the_seed_for_a_name_is_no_other_one():
