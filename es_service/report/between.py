@@ -333,10 +333,15 @@ def _plain(value: float) -> str:
     return number(value) if np.isfinite(value) else "--"
 
 
+_ESCAPES = {sign: f"\\{sign}" for sign in "_%&#${}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+
 def _escaped(text: str) -> str:
-    for sign in ("\\", "_", "%", "&", "#", "$", "{", "}"):
-        text = text.replace(sign, r"\textbackslash{}" if sign == "\\" else "\\" + sign)
-    return text
+    return text.translate(str.maketrans(_ESCAPES))
 
 
 def checked_kind(file: Path) -> str:

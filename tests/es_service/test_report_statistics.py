@@ -120,6 +120,13 @@ def test_p_over_several_tasks_compares_within_each():
     assert (found.improvement, found.p) == (1.0, pytest.approx(2 / 400))
 
 
+def test_no_p_is_zero_where_ways_are_drawn():
+    """Of the 252 ** 3 ways of three tasks, none of those that are drawn is as uneven as what was found."""
+    found = statistics.difference([np.arange(5.0) + 10] * 3, [np.arange(5.0)] * 3)
+    assert found.p == pytest.approx(1 / (1 + statistics.DRAWS))
+    assert found.smallest_p < found.p
+
+
 def test_paired_runs_are_compared_with_those_of_the_same_seed():
     x, y = np.array([1.0, 5.0, 9.0, 20.0, 31.0, 40.0]), np.array([0.5, 4.0, 8.2, 18.0, 28.0, 40.1])
     found = statistics.difference([x], [y], paired=True)
@@ -225,3 +232,9 @@ def test_a_profile_is_drawn_from_all_runs_above_each_value(runs, axes):
 def test_runs_without_partners_cannot_be_paired(runs):
     with pytest.raises(ConfigError, match=r"es has the seeds \[0, 1, 2, 3\], me_es has \[0, 1, 2\]"):
         between.compared(compare.grouped(runs[:7]), paired=True)
+
+
+def test_names_of_groups_are_text_in_tables_of_latex():
+    average = between.Average("a_1 \\ {50 %} ~^", 2, 1.0, None, None, None)
+    text = between.text_of([between.Compared("best", "best", False, (average,), ())], ".tex")
+    assert r"a\_1 \textbackslash{} \{50 \%\} \textasciitilde{}\textasciicircum{} & 2" in text
