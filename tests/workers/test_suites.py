@@ -105,6 +105,12 @@ def test_several_choices_and_actuators() -> None:
     np.testing.assert_allclose(actuators.of(jnp.array([0.5, 0.0]), True), [[3.0, 0.0]])
 
 
+def test_what_the_actions_1_become_is_told_with_a_task() -> None:
+    pushes = Actuators(np.array([-2.0, 0.0]), np.array([2.0, 1.0]))
+    assert describe_suite(grid(actions=pushes, mask=None), {}, {}).action_bounds == ((-2.0, 2.0), (0.0, 1.0))
+    assert describe_suite(grid(), {}, {}).action_bounds == ()
+
+
 def test_simd_computes_the_steps_and_the_draws_of_a_suite() -> None:
     actions = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
     run = steps_of(make_suite(grid()), actions)
@@ -155,6 +161,14 @@ def test_the_first_steps_of_gymnax_are_its_own_and_simds(name: str) -> None:
     run = steps_of(environment, numbers)
     compare(jax.jit(jax.vmap(run))(keys()), jax.jit(jax.vmap(of_gymnax))(keys()))
     compare(compile_kernel(run, jax.ShapeDtypeStruct((4,), jnp.uint32))(keys()), jax.jit(jax.vmap(run))(keys()))
+
+
+@pytest.mark.slow
+def test_the_bounds_of_a_gymnax_descriptor_follow_its_options() -> None:
+    pytest.importorskip("gymnax")
+    for options, most in ({}, 8.0), ({"max_speed": 3.0}, 3.0):
+        task = describe_environment("gymnax:Pendulum-v1", {"options": {"descriptor": [2], **options}})
+        assert (task.descriptor_bounds, task.action_bounds) == (((-most, most),), ((-2.0, 2.0),))
 
 
 @pytest.mark.long

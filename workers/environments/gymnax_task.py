@@ -53,7 +53,8 @@ def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({}))
         if field.name != LENGTH and type(value := getattr(parameters, field.name)) in (bool, int, float)
     }
     options = {key: Option(value) for key, value in defaults.items()}
-    return describe_suite(_suite(name, environment, parameters), options, given)
+    changed = parameters.replace(**{key: value for key, value in given.items() if key in defaults})
+    return describe_suite(_suite(name, environment, changed), options, given)
 
 
 def make(name: str, descriptor: Any = None, **parameters: Any) -> Environment:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import Option, OptionValue
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import quietly
+from workers.environments.host_task import action_bounds
 from workers.environments.keys import words_in_place_of_keys
 
 
@@ -61,6 +62,7 @@ class Choices:
     counts: tuple[int, ...]
     """Numbers of choices; with a single one, the suite's action is a number and not an array."""
     single: bool = True
+    bounds: ClassVar[Bounds] = ()
 
     @property
     def size(self) -> int:
@@ -87,6 +89,12 @@ class Actuators:
     def size(self) -> int:
         """Numbers in an action of the policy."""
         return int(np.size(self.low))
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the actions -1 and 1 of a policy become, for each number."""
+        pairs = zip(np.ravel(self.low).tolist(), np.ravel(self.high).tolist(), strict=True)
+        return action_bounds(tuple(pairs), self.size)
 
     def of(self, action_A: Any, allowed_A: Any) -> Any:
         """The suite's action."""
@@ -141,6 +149,7 @@ def describe_suite(suite: Suite, options: Mapping[str, Option], given: Mapping[s
         final_fitness=False,
         has_goal=False,
         options={"descriptor": Option(None), **options},
+        action_bounds=suite.actions.bounds,
         discrete_actions=isinstance(suite.actions, Choices) and suite.actions.single and suite.mask is None,
         summary=f"an environment of {suite.name.partition(':')[0]}",
     )
