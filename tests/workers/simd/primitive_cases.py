@@ -348,7 +348,8 @@ def keys_of_jax(draw: Draw) -> Case:
         chosen = jnp.where(which, keys[1, 1], jax.random.fold_in(keys[0, 0], number))
         batch = jax.vmap(jax.random.fold_in, (0, None))(keys.reshape(-1), number)
         seeded = jax.random.key(number), jax.random.key(seed)
-        return [jax.random.key_data(one) for one in (keys.T[1:], chosen, jnp.roll(keys, 1, 0), batch, *seeded)]
+        moved = [jax.random.key_data(one) for one in (keys.T[1:], chosen, jnp.roll(keys, 1, 0), batch, *seeded)]
+        return moved, keys == jnp.where(which, keys, keys.T), keys[0] != chosen
 
     def carried(words, number, which):
         scanned, _ = lax.scan(lambda key, _: (jax.random.split(key)[1], None), words, None, length=2)

@@ -23,6 +23,9 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     node_dtype = graph_dtype(dtype)
     if node_dtype == "f":
         return t.ops(name, a, b)
+    if node_dtype == "k":
+        same = t.ops("and", *np.moveaxis(t.ops("ieq", t.words(a), t.words(b)), -1, 0))
+        return same if name == "eq" else _not(t, same)
     less = "slt" if is_signed(dtype) else "ult"
     if node_dtype == "b":
         if name not in ("eq", "ne"):
