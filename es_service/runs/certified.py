@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 from numpy.typing import NDArray
 from pydantic import create_model
@@ -53,9 +53,8 @@ class Elsewhere:
 
     @property
     def title(self) -> str:
-        """The task and the options that were set: "mujoco:Ant-v5 (solver_iterations = 6)"."""
-        options = ", ".join(f"{name} = {show(value)}" for name, value in self.options.items())
-        return f"{self.task} ({options})" if options else self.task
+        """`task_title` of the task and the options that were set."""
+        return task_title(self.task, self.options)
 
     def gaps(self, here: Episodes) -> dict[str, float | None]:
         """How much higher each mean and the share of successes are than `here`, with intervals, by column name; None
@@ -68,6 +67,12 @@ class Elsewhere:
             gap = None if lacks else interval_of(here_E, there[name], paired=self.paired)
             columns |= interval_columns(f"gap_{name}", gap)
         return columns
+
+
+def task_title(task: str, options: Mapping[str, Any]) -> str:
+    """A task with its options in words: "mujoco:Ant-v5 (solver_iterations = 6)"."""
+    shown = ", ".join(f"{name} = {show(value)}" for name, value in options.items())
+    return f"{task} ({shown})" if shown else task
 
 
 @dataclass(frozen=True)
@@ -193,6 +198,37 @@ def certified_elsewhere(folder: Path) -> dict[str, Certified]:
     return {one.elsewhere.title: one for one in firsts if one.elsewhere is not None}
 
 
+class CertifiedValue(NamedTuple):
+    """What a certified policy does in a task, that of the run or another one."""
+
+    policy: Certified
+    episodes: Episodes
+    """Its certification episodes in this task."""
+
+
+def certified_by_task(folder: Path) -> dict[str, CertifiedValue]:
+    """Title of a task -> the value of the policy that the newest certification in it has put first.
+
+    The run's own task is the first, if a policy is certified; its title names the options that are not its defaults. So
+    a run that was trained in a task has its value under the same title as one that was only certified there. Raises
+    StoreError if one of these policies is damaged.
+    """
+    values: dict[str, CertifiedValue] = {}
+    if (newest := newest_certified(folder)) is not None:
+        meta = read_meta(folder)
+        settings, declared = meta.config["task"], meta.task["options"]
+        changed = {
+            name: value
+            for name, value in settings["options"].items()
+            if name not in declared or value != declared[name]["default"]
+        }
+        values[task_title(settings["environment"], changed)] = CertifiedValue(newest, newest.episodes)
+    for title, policy in certified_elsewhere(folder).items():
+        if policy.elsewhere is not None:
+            values.setdefault(title, CertifiedValue(policy, policy.elsewhere.episodes))
+    return values
+
+
 def decisions(policies: Iterable[Certified]) -> list[Certified]:
     """Those of a run's certifications whose episodes decide if it has reached `budget.target_certified`."""
     return [policy for policy in policies if policy.decides and policy.episodes.count >= EPISODES]
@@ -208,10 +244,11 @@ def report_of(policies: Iterable[Certified], decision: Certified) -> Certified |
     """The certified value of a policy that has passed a decision: of later episodes, which decide nothing. None if it
     is still missing."""
     later = (one for one in policies if one.number > decision.number and not one.decides)
-    return next((one for one in later if one.episodes.count >= EPISODES and _same_policy(one, decision)), None)
+    return next((one for one in later if one.episodes.count >= EPISODES and is_same_policy(one, decision)), None)
 
 
-def _same_policy(one: Certified, other: Certified) -> bool:
+def is_same_policy(one: Certified, other: Certified) -> bool:
+    """Whether two certifications are of one policy."""
     return all(ours.tobytes() == theirs.tobytes() for ours, theirs in zip(one.policy, other.policy, strict=True))
 
 

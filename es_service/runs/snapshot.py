@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
@@ -47,6 +47,9 @@ class Policy:
     observation_mean_O: FloatArray = field(repr=False)
     observation_std_O: FloatArray = field(repr=False)
     observation_clip: float | None
+    certified: Mapping[str, Mapping[str, float | int | None]] = field(default_factory=dict, repr=False)
+    """Of `policy("certified")`: title of a task -> means with their intervals and successes there, by the names of the
+    columns of `Run.certified`; the run's own task first, then others in which it was certified."""
 
     def __call__(self, observation: Any) -> FloatArray:
         """Action for a raw (not normalised) observation, as in evaluations: without noise, and the most probable one.

@@ -18,7 +18,13 @@ from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, No
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.system import given_path
-from es_service.runs.certified import all_certifications, certified_policies, newest_certified
+from es_service.runs.certified import (
+    all_certifications,
+    certified_by_task,
+    certified_policies,
+    is_same_policy,
+    newest_certified,
+)
 from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, map_names
 from es_service.runs.strangers import policy_spec, sound_contents, sound_meta, sound_nodes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -203,6 +209,29 @@ class Run:
         return pd.DataFrame([policy.row() for policy in certified_policies(self.folder)])
 
     @property
+    def certified_by_task(self) -> pd.DataFrame:
+        """The newest certified value in each task, one row per task, indexed by its title: the run's own task first,
+        then the others in which policies were certified. Empty if there are none.
+
+        Columns are those of `certified` for a task alone: certification, policy, generation, episodes, means with
+        their intervals, successes.
+        """
+        import pandas as pd
+
+        rows = [
+            {
+                "task": task,
+                "certification": value.policy.number,
+                "policy": value.policy.name,
+                "generation": value.policy.generation,
+                "episodes": value.episodes.count,
+                **value.episodes.values(),
+            }
+            for task, value in certified_by_task(self.folder).items()
+        ]
+        return pd.DataFrame(rows).set_index("task") if rows else pd.DataFrame()
+
+    @property
     def decisions(self) -> pd.DataFrame:
         """The tries to reach `budget.target_certified`, with the columns of `certified`; empty if there are none.
 
@@ -246,7 +275,8 @@ class Run:
                 statistics of their evaluation; or "centre" (the centre that the newest generation updated, the fittest
                 of several), with the statistics it would use next.
 
-        "certified" is the policy that the newest certification of the run has put first.
+        "certified" is the policy that the newest certification of the run has put first; its attribute `certified` has
+        its values by task.
 
         Raises NotInRunError for "certified" if the run has no certification, for a cell that does not exist or is
         empty, and for "centre" if the newest generation evaluated only policies, as those of map_elites do; ConfigError
@@ -262,7 +292,9 @@ class Run:
             if policy is None:
                 way_out = WayOut("certify", "certify one", str(self.folder))
                 raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])
-            return make_policy(self.meta, policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
+            values = certified_by_task(self.folder).items()
+            values = {task: one.episodes.values() for task, one in values if is_same_policy(one.policy, policy)}
+            return replace(make_policy(self.meta, *policy.policy), certified=values)
         if isinstance(which, str):
             allowed = "'best', 'centre', 'certified', or a cell such as (3, 17)"
             raise ConfigError(f"policy({which!r}): choose {allowed}", field="which", value=which, allowed=allowed)

@@ -26,6 +26,7 @@ from es_service.runs.certified import (
     Certified,
     Elsewhere,
     all_certifications,
+    certified_by_task,
     certified_elsewhere,
     certified_policies,
 )
@@ -117,6 +118,7 @@ def test_pairs_with_the_same_starts_have_the_interval_of_their_differences(copie
     [windy] = certify_run(of_python.folder, episodes=32, task=f"{TASKS}Slippery", on_notice=said.append)
     assert f"task.options.push is 0.1 in {TASKS}Drift, and 0.2 in {TASKS}Slippery" in said
     assert windy.elsewhere is not None
+    assert [*of_python.certified_by_task.index] == [f"{TASKS}Drift (wind = 0.002)", f"{TASKS}Slippery (wind = 0.002)"]
     assert windy.elsewhere.paired, "both draw the same place from a seed"
     differences = windy.elsewhere.episodes.return_E - windy.episodes.return_E
     shown = [windy.row()[f"gap_return_{end}"] for end in ("mean", "low", "high")]
@@ -171,6 +173,15 @@ def test_every_reader_shows_the_other_tasks(copied, tmp_path):
     elsewhere = certified_elsewhere(copied.folder)
     assert {task: one.number for task, one in elsewhere.items()} == {"point_maze": 3, "point_maze (start = corner)": 1}
     corner = elsewhere["point_maze (start = corner)"].row()
+    by_task = copied.certified_by_task
+    assert by_task.index.tolist() == ["point_maze", "point_maze (start = corner)"], "its own task is the first"
+    assert by_task["certification"].tolist() == [3, 1]
+    own, there = by_task["return_mean"]
+    assert own == certified_by_task(copied.folder)["point_maze"].episodes.return_E.mean()
+    assert there == corner["elsewhere_return_mean"]
+    values = copied.policy("certified").certified
+    assert {task: one["return_mean"] for task, one in values.items()} == by_task["return_mean"].to_dict()
+    assert copied.policy("best").certified == {}
     gap = "gap {} [{}, {}]".format(*(number(corner[f"gap_return_{end}"]) for end in ("mean", "low", "high")))
     assert corner["gap_return_high"] < 0.0, "so none has a sign before it"
     status = runner.invoke(app, ["status", str(copied.folder)], catch_exceptions=False).stdout
