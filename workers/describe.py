@@ -20,7 +20,7 @@ from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import option_values
 from es_service.protocol.parent import end_soon, write_answer
 from es_service.protocol.sources import SUITES
-from workers.environments import TaskError, describe_environment
+from workers.environments import TaskError, choices_of, describe_environment
 from workers.host.repeats import tried_apart
 from workers.rollouts import BACKENDS
 
@@ -53,7 +53,7 @@ def main(name: str, settings: str, file: str) -> None:
         task = described(name, given)
         if task.kind == "python":
             options = option_values(task.options, given.get("options", {}))
-            task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options))
+            task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options, choices_of(given)))
         elif task.kind == "jax" and name.partition(":")[0] not in ("brax", "mujoco", *SUITES):
             from workers.traces import require_pure
 

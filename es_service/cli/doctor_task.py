@@ -14,6 +14,8 @@ from es_service.runs.repeating import compared, examined
 
 SECONDS = 1.0
 """Duration of the measurement."""
+NEW_OBJECTS = "new_objects"
+"""Setting of `settings_of_description`."""
 FAR_FROM_C = 1e-3
 """Relative error of velocities after one control step above which the physics is another one."""
 
@@ -48,8 +50,11 @@ def task_findings(name: str) -> Iterator[Finding]:
             return
     answers = [examined(name, {}, SECONDS) for _ in range(1 if task.kind == "jax" else 2)]
     for answer in answers:
-        if problem := answer.get("problem") or answer["fault"]:
-            yield "FAIL", answer.get("problem") or f"an episode of a random policy is invalid {problem}"
+        if problem := answer.get("problem"):
+            yield "FAIL", f"{name}: {problem}"
+            return
+        if fault := answer["fault"]:
+            yield "FAIL", f"{name}: an episode of a random policy is invalid {fault}"
             return
     if task.kind == "jax":
         yield "ok", "the observations and rewards of episodes of random policies are finite"
@@ -63,11 +68,27 @@ def task_findings(name: str) -> Iterator[Finding]:
             f"it does not repeat: with the same seed and actions it returns other numbers {' and '.join(other)}, so "
             "neither does a run: other workers and a resume find other numbers, and `verify` says that it cannot judge",
         )
+        if task.kind == "python":
+            yield from _with_new_objects(name)
     else:
         yield "ok", f"it repeats bit for bit with the same seed and actions: {', '.join(tried)}"
     unit = "calls" if task.kind == "function" else "steps"
     rate, memory = max(result["steps_per_second"] for result in (first, second)), first["peak_mib"]
     yield "ok", f"{rate:,.0f} {unit}/s on one core without a policy; its process takes {memory:,} MiB"
+
+
+def _with_new_objects(name: str) -> Iterator[Finding]:
+    """Whether a task repeats itself if each episode has a new object."""
+    answers = [examined(name, {NEW_OBJECTS: True}, SECONDS) for _ in range(2)]
+    if any("problem" in answer for answer in answers) or compared(*answers)[1]:
+        yield "note", "nor does it repeat if each episode has a new object"
+        return
+    rate = max(answer["steps_per_second"] for answer in answers)
+    yield (
+        "note",
+        "its objects carry something over from one episode to the next. With task.new_object_each_episode=true each "
+        f"episode has a new object, and it repeats bit for bit, at {rate:,.0f} steps/s on one core",
+    )
 
 
 def step_findings(task: TaskSpec, cost: Mapping[str, Any]) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -167,8 +168,9 @@ app.add_typer(bench, name="bench")
 
 @app.command()
 def doctor(
-    task: Annotated[
-        str | None, typer.Argument(metavar="[TASK]", help="Check this task instead: does it repeat, how fast is it?")
+    tasks: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[TASK]...", help="Check these tasks instead: do they repeat, how fast are they?"),
     ] = None,
     cluster: Annotated[
         str | None,
@@ -181,10 +183,10 @@ def doctor(
     from es_service.cli.doctor_task import task_findings
     from es_service.dispatch.cluster_findings import cluster_findings
 
-    if task is None:
+    if not tasks:
         found = findings() if cluster is None else cluster_findings(cluster)
     elif cluster is None:
-        found = task_findings(task)
+        found = chain.from_iterable(map(task_findings, tasks))
     else:
         raise ConfigError("--cluster is no check of a task; leave it or the task out")
     raise typer.Exit(0 if print_findings(found, as_json=as_json) else 1)

@@ -33,7 +33,7 @@ from es_service.config.parts import TASK_OPTIONS, as_tuple
 from es_service.config.resolution import Unknown, Values, asks
 from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of
 from es_service.config.search import SearchConfig, preset_rows
-from es_service.config.tasks import Tasks, read_options, settings_of_task
+from es_service.config.tasks import CHOICES, Tasks, read_options, settings_of_task
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
 from es_service.config.values import allowed_words, value_problems
 from es_service.errors import ConfigError, Problem, counted
@@ -241,7 +241,7 @@ def _left_out(
 
     if is_replaced("task.environment"):
         why = f"{wanted['task.environment']} replaces its task"
-        left_out |= {key: why for key in file if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
+        left_out |= {key: why for key in file if key.startswith(TASK_OPTIONS) or key in CHOICES}
     if settings is None:
         return {key: why for key, why in left_out.items() if key not in wanted}
     if other := is_replaced("search.algorithm"):

@@ -32,7 +32,7 @@ from es_service.config.parts import (
 )
 from es_service.config.search import SearchConfig
 from es_service.config.text import dump_yaml
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import HostChoices, TaskSpec
 from es_service.protocol.policy_spec import Activation, Output
 from es_service.protocol.sources import task_code
 
@@ -59,6 +59,16 @@ class TaskConfig(Section):
         "the last observation. A name: this key of the last step's info. module:function: a function of the episode. "
         "null: that of the task.",
     )
+    success: Text | None = Field(
+        None,
+        description="For tasks of Python objects: key of the last step's info that says whether an episode has "
+        "succeeded. null: as the task says, or is_success.",
+    )
+    new_object_each_episode: Switch = Field(
+        False,
+        description="For tasks of Python objects: whether each episode has a new object, for simulators that carry "
+        "something over from one episode to the next. `es-service doctor TASK` finds whether they do.",
+    )
     time_limit_s: Positive | None = Field(
         None,
         description="Longest time in seconds of a chunk of episodes, for tasks of Python objects, or of a call of a "
@@ -67,6 +77,11 @@ class TaskConfig(Section):
     options: Options = Field(
         default_factory=dict, description="Settings of the task, such as `start`, which the task declares."
     )
+
+    @property
+    def choices(self) -> HostChoices:
+        """What is chosen for a task of Python objects."""
+        return HostChoices(self.descriptor, self.success, self.new_object_each_episode)
 
     @property
     def code(self) -> tuple[str, ...]:

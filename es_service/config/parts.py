@@ -19,6 +19,8 @@ from es_service.protocol.options import OptionValue
 TASK_OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."
 """Prefixes of the keys in two groups inside sections; a task declares those of the first."""
+LARGEST = 1e30
+"""Largest absolute value of bounds, offsets and starts, so that their sums and differences stay finite."""
 
 
 def as_tuple(value: Any) -> Any:

@@ -15,9 +15,9 @@ from typing import Any
 
 from es_service.config.given import start_of
 from es_service.config.keys import BUDGET, FIELDS
-from es_service.config.parts import RESOURCES, TASK_OPTIONS, counts
+from es_service.config.parts import LARGEST, RESOURCES, TASK_OPTIONS, counts
 from es_service.config.resolution import Unknown, Values, only_centres
-from es_service.config.tasks import CALLER
+from es_service.config.tasks import CALLER, is_start
 from es_service.config.text import not_allowed, one_of, problem_of, show, wrong_value
 from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec
@@ -34,8 +34,6 @@ PLACES_PER_CENTROID = {"lloyd": 50, "kmeans": 10}
 LLOYD_STEPS = 20
 MOST_PLACING_S = 600.0
 """Longest estimated time of that, in seconds."""
-LARGEST = 1e30
-"""Largest absolute value of bounds and offsets, so that their sums and differences stay finite."""
 MOST_PARAMETERS = 80_000_000
 """The store keeps a centre and Adam's two moments, 12 bytes per parameter, in one value; SQLite allows 1e9 bytes."""
 MOST_DESCRIPTOR_DIMENSIONS = 974
@@ -79,6 +77,15 @@ def descriptor_fits(config: Values, task: TaskSpec) -> Problems:
         yield problem_of(key, config[key], what, allowed=f"at most {MOST_DESCRIPTOR_DIMENSIONS}")
 
 
+def choices_are_for_objects(config: Values, task: TaskSpec) -> Problems:
+    if task.kind != "python":
+        why = f" for {task.name}, which is no task of Python objects"
+        if (key := config["task.success"]) is not None:
+            yield not_allowed("task.success", key, "null", why=why)
+        if config["task.new_object_each_episode"]:
+            yield not_allowed("task.new_object_each_episode", True, "false", why=why)
+
+
 def time_limit_is_for_steps_of_unequal_times(config: Values, task: TaskSpec) -> Problems:
     if (limit := config["task.time_limit_s"]) is not None and task.kind == "jax":
         why = f" for {task.name}, whose steps take equal times"
@@ -98,6 +105,11 @@ def callers_episodes(config: Values, task: TaskSpec) -> Problems:
         why = f" for {task.name}, of which no new episodes can be run"
         hint = "; budget.target_fitness ends the run at a value of the episodes that the caller computes"
         yield not_allowed("budget.target_certified", target, "null", why=why, hint=hint)
+    start, parameters = config.given.get(f"{TASK_OPTIONS}start"), config[f"{TASK_OPTIONS}parameters"]
+    if start is not None and not (parameters and is_start(start, parameters)):
+        what = f"a list of {parameters} numbers, one for each of task.options.parameters"
+        why = "" if parameters else ", which belongs to task.options.parameters"
+        yield not_allowed(f"{TASK_OPTIONS}start", start, what if parameters else "left out", why=why)
     if task.parameters is None and 0 in (config[TASK_OPTIONS + name] for name in ("observation_size", "action_size")):
         what = "the caller's episodes have no size; set it, or task.options.observation_size and action_size"
         yield problem_of(f"{TASK_OPTIONS}parameters", 0, what, allowed="at least 1")
@@ -388,6 +400,7 @@ METHOD_RULES: tuple[Rule, ...] = (centres_fit_the_method, statistics_need_traini
 RULES: tuple[Rule, ...] = (
     fitness_fits,
     descriptor_fits,
+    choices_are_for_objects,
     time_limit_is_for_steps_of_unequal_times,
     low_rank_noise_needs_matrices,
     callers_episodes,

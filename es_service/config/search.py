@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -112,6 +112,21 @@ class SearchConfig(Section):
         description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
         "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
     )
+
+    if TYPE_CHECKING:  # for `config.search.sigma` in a user's program, whose config has such a method
+        # The keys of PopulationConfig, whose types a language server then knows of `RunConfig.search`, too. Of a search
+        # without them, an access raises AttributeError.
+        pairs: int = 0
+        sigma: float = 0.0
+        noise: Noise = Field()
+        sigma_decay: float = 0.0
+        sigma_limit: float = 0.0
+        step: Step = Field()
+        learning_rate_decay: float = 0.0
+        learning_rate_limit: float = 0.0
+        step_gate: bool = False
+        shaping: Shaping = Field()
+        common_random_numbers: bool = False
 
     presets: ClassVar[tuple[PresetRow, ...]] = (
         # Column norms: 1.0 in hidden layers and 0.01 in the output layer, or 0.01 in every layer.

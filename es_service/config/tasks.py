@@ -12,14 +12,14 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, TypeGuard
 
 from es_service.config.model import RunConfig
-from es_service.config.parts import TASK_OPTIONS
+from es_service.config.parts import LARGEST, TASK_OPTIONS
 from es_service.config.resolution import options_of
 from es_service.config.text import in_line, nearest, one_of, problem_of, show, wrong_value
 from es_service.errors import ConfigError, Problem
-from es_service.protocol.messages import UNBOUNDED, DescriptorChoice, TaskSpec, with_options
+from es_service.protocol.messages import NO_CHOICES, UNBOUNDED, HostChoices, TaskSpec, with_options
 from es_service.protocol.options import (
     Option,
     OptionValue,
@@ -44,17 +44,21 @@ OPTIONS = {
     "observation_size": Option(0, low=0, high=1_000_000),
     "action_size": Option(0, low=0, high=1_000_000),
     "parameters": Option(0, low=0, high=10_000_000),
+    "start": Option(None),
     "descriptor_size": Option(2, low=1, high=1000),
     "episode_steps": Option(1, low=1),
 }
-"""Either the sizes of a policy, or the number of parameters of something else; and the dimensions of the descriptor."""
+"""Either the sizes of a policy, or the number of parameters of something else and where the search starts, a list with
+a value for each (zeros if there is none); and the dimensions of the descriptor."""
 
 
 def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
     """Description of the task with these options; those that are left out or not allowed have their defaults."""
     values = option_values(OPTIONS, options)
+    given = values.pop("start", ())
     observations, actions, parameters, dimensions, steps = (int(str(value)) for value in values.values())
     names = tuple(f"p{index}" for index in range(parameters))
+    start = tuple(map(float, given)) if is_start(given, parameters) else (0.0,) * parameters
     return TaskSpec(
         name=CALLER,
         observation_size=1 if parameters else max(1, observations),
@@ -67,12 +71,23 @@ def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
         options=dict(OPTIONS),
         summary="episodes that the program computes which asks the search",
         kind=CALLER,
-        parameters=ParameterSpec(names, (FREE,) * parameters, (0.0,) * parameters) if parameters else None,
+        parameters=ParameterSpec(names, (FREE,) * parameters, start) if parameters else None,
     )
 
 
+CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode")
+"""Keys of `HostChoices`."""
 DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
+
+
+def is_start(given: object, parameters: int) -> TypeGuard[list[float]]:
+    """Whether a value is a list with a number for each parameter."""
+    return (
+        isinstance(given, list)
+        and len(given) == parameters
+        and all(type(value) in (int, float) and abs(value) < LARGEST for value in given)
+    )
 
 
 class Tasks(Mapping[str, TaskSpec]):
@@ -81,10 +96,10 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
-        return self.chosen(name, {}, None)
+        return self.chosen(name, {}, NO_CHOICES)
 
-    def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
-        """The task with options and a descriptor. Raises as a lookup.
+    def chosen(self, name: str, options: Mapping[str, OptionValue], choices: HostChoices) -> TaskSpec:
+        """The task with options and what else a config chooses of it. Raises as a lookup.
 
         What is found by a trial (shapes, the rollouts that can run it, whether it repeats itself) holds for the
         options, so a task of which some are not the defaults is described twice.
@@ -94,8 +109,8 @@ class Tasks(Mapping[str, TaskSpec]):
         if ":" not in name:
             return environments.SHIPPED[name]
         require_no_import_of_a_task()
-        settings = environments.settings_of_description(name, options, descriptor)
-        code = tuple(user_sources(*task_code(name, descriptor, options)).items())
+        settings = environments.settings_of_description(name, options, choices)
+        code = tuple(user_sources(*task_code(name, choices.descriptor, options)).items())
 
         def described(settings: Mapping[str, Any]) -> TaskSpec:
             return _described(name, json.dumps(settings, sort_keys=True), code)
@@ -128,7 +143,7 @@ def require_same_task(config: RunConfig) -> None:
     """Raise ConfigError if the task has changed since its values were filled into the config, such as its episode
     length: the run would have some values of the old task and some of the new one."""
     settings, before = config.task, config.made.task
-    task = TASKS.chosen(settings.environment, settings.options, settings.descriptor)
+    task = TASKS.chosen(settings.environment, settings.options, settings.choices)
     if changes := _changes(before, task):
         raise ConfigError(
             f"the task {task.name} has changed since this config was loaded ({', '.join(changes)}); load the config "
@@ -161,7 +176,7 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     answer = json.loads(told.content)
     if "problem" in answer:
         problem = answer["problem"]
-        named = re.match(r"(task\.(?:descriptor|options\.\w+)) = ", problem)
+        named = re.match(r"(task\.(?:\w+|options\.\w+)) = ", problem)
         raise ConfigError(problem, field=named and named[1])
     return task_from_fields(answer["task"])
 
@@ -217,7 +232,13 @@ def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> di
         descriptor = tuple(descriptor)
     is_chosen = descriptor and (isinstance(descriptor, str) or all(type(index) is int for index in descriptor))
     options = {key: value for key, value in options_of(chosen).items() if is_plain(value)}
-    return {"options": options, "descriptor": descriptor if is_chosen else None}
+    success = chosen.get("task.success")
+    choices = HostChoices(
+        descriptor if is_chosen else None,
+        success if isinstance(success, str) and success else None,
+        chosen.get("task.new_object_each_episode") is True,
+    )
+    return {"options": options, "choices": choices}
 
 
 def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:

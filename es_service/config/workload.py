@@ -49,7 +49,7 @@ def worker_spec(
         seed=config.seed,
         environment=settings.environment,
         environment_options=dict(settings.options),
-        descriptor=settings.descriptor,
+        choices=settings.choices,
         allow_infeasible=search.allow_infeasible,
         time_limit_s=settings.time_limit_s,
         descriptor_size=0 if settings.descriptor is None else len(task.descriptor_names),

@@ -98,6 +98,21 @@ class TaskSpec:
     """What its author probably did not intend, such as an attribute with an unknown name, in sentences."""
 
 
+@dataclass(frozen=True)
+class HostChoices:
+    """What a config chooses for a task of Python objects besides its options, by keys of `task`."""
+
+    descriptor: DescriptorChoice | None = None
+    """None: the descriptor of the task."""
+    success: str | None = None
+    """Key of the last `info` that says whether an episode has succeeded; None: as the task says."""
+    new_objects: bool = False
+    """Whether each episode has an object of its own."""
+
+
+NO_CHOICES = HostChoices()
+
+
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:
     """The task with the descriptor that its option `descriptor` chooses; unchanged if `options` choose none."""
     chosen = options.get("descriptor")
@@ -132,14 +147,14 @@ class WorkerSpec:
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     noise_rank: int = 0
     """Rank of the noise of each weight matrix, as in `low_rank.py`; 0: each parameter has a number of its own."""
-    descriptor: DescriptorChoice | None = None
-    """Descriptor that the config chooses; None: that of the task."""
+    choices: HostChoices = NO_CHOICES
+    """What the config chooses for a task of Python objects."""
     allow_infeasible: bool = False
     """Whether a fitness of -inf says that a point is infeasible, which is no failure."""
     time_limit_s: float | None = None
     """Longest time of a call of a function, if the task is one; None: it has none."""
     descriptor_size: int = 0
-    """How many numbers that descriptor has; 0 if it is the task's."""
+    """How many numbers the descriptor has that the config chooses; 0 if it is the task's."""
     outputs: tuple[str, ...] = ()
     """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
     keyed_resets: bool = False
@@ -157,7 +172,7 @@ class WorkerSpec:
     @property
     def task_code(self) -> tuple[str, ...]:
         """`sources.task_code` of its task."""
-        return task_code(self.environment, self.descriptor, self.environment_options)
+        return task_code(self.environment, self.choices.descriptor, self.environment_options)
 
 
 class WorkerPlace(NamedTuple):

@@ -24,7 +24,8 @@ class Option:
     """A setting whose values have the type of its default: bool, int, float or str."""
 
     default: OptionValue | None
-    """None, of Gymnasium's environments alone: what the environment has by itself; any plain value is allowed."""
+    """None: no value unless one is given, which may be any plain one. Only our own tasks have such options: those of
+    Gymnasium, whose environments then have what they have by themselves, and the start of a caller's episodes."""
     low: float | None = None
     high: float | None = None
     """Least and greatest value of a number, both allowed; None for no bound."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import posixpath
 import shlex
 import tempfile
 import time
@@ -21,7 +22,7 @@ from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
 
-from es_service.errors import ConfigError, EvaluationError, ServiceError, WayOut
+from es_service.errors import ConfigError, EvaluationError, ServiceError, StoreError, WayOut
 from es_service.runs.job_package import JobPackage, write_package
 
 FOLDER = "es_service_run"
@@ -46,9 +47,17 @@ def submit(package: JobPackage, address: str) -> str:
     """Submit a job to the cluster whose dashboard is at `address`, and return its id.
 
     Raises:
+        StoreError: a job of this cluster that has not ended writes to the same folder.
         EvaluationError: the cluster does not answer, or refuses the job.
     """
     client = _client(address)
+    for job in _jobs(client, address):
+        if job.state not in ENDED and posixpath.normpath(job.folder) == posixpath.normpath(package.out):
+            raise StoreError(
+                f"the job {job.id}, which is {job.state}, has the folder {package.out}, too; choose another folder, or "
+                "stop that job first",
+                run=package.out,
+            )
     with tempfile.TemporaryDirectory() as folder:
         write_package(package, Path(folder))
         with _explained(address):
@@ -62,8 +71,12 @@ def submit(package: JobPackage, address: str) -> str:
 
 def list_jobs(address: str) -> list[Job]:
     """The es-service jobs on a cluster, newest first. Raises EvaluationError as `submit`."""
+    return _jobs(_client(address), address)
+
+
+def _jobs(client: Any, address: str) -> list[Job]:
     with _explained(address):
-        all_jobs = _client(address).list_jobs()
+        all_jobs = client.list_jobs()
     ours = [
         Job(job.submission_id, str(job.status.value), job.metadata[FOLDER], job.start_time or 0)
         for job in all_jobs

@@ -85,7 +85,7 @@ def other_task(config: RunConfig, name: str, overrides: Overrides = ()) -> Other
         there = _described(name, wanted) or declared
         if unequal := _unequal(config, here, there, options_in(there, wanted)):
             raise ConfigError.listing(f"the policies of {here.name} cannot run in {name}", unequal)
-    loaded = load_config(_config(config, name), wanted, new=False, searches=False, name=f"the task {name}")
+    loaded = load_config(_config(config, name, declared), wanted, new=False, searches=False, name=f"the task {name}")
     there, options = task_of(loaded), loaded.task.options
     were_set = {option: value for option, value in options.items() if f"{TASK_OPTIONS}{option}" in wanted}
     return OtherTask(loaded, there, were_set, _differences(config, here, loaded, there, given))
@@ -126,12 +126,13 @@ def options_in(task: TaskSpec, wanted: Mapping[str, Any]) -> dict[str, OptionVal
     return option_values(task.options, given)
 
 
-def _config(config: RunConfig, name: str) -> dict[str, Any]:
+def _config(config: RunConfig, name: str, declared: TaskSpec | None) -> dict[str, Any]:
     """What another task has of the config of a run."""
     sections = config.model_dump(mode="json")
     compute = {key: value for key, value in sections["compute"].items() if key not in COMPUTE_CONSTANTS}
+    of_objects = ("success", "new_object_each_episode") if declared and declared.kind == "python" else ()
     return {
-        "task": {"environment": name, "episode_steps": config.task.episode_steps},
+        "task": {"environment": name, **{key: sections["task"][key] for key in ("episode_steps", *of_objects)}},
         "policy": sections["policy"],
         "map": {"enabled": False},
         "compute": {**compute, "inline_workers": "processes", "worker_resources": {}},

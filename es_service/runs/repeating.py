@@ -56,7 +56,7 @@ def why_task_does_not_repeat(config: RunConfig) -> str:
     if task.kind not in ("python", "function"):
         return ""
     options = config.task.options
-    settings = settings_of_description(config.task.environment, options, config.task.descriptor) | {"options": options}
+    settings = settings_of_description(config.task.environment, options, config.task.choices) | {"options": options}
     answers = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
     if any("problem" in answer for answer in answers):
         return ""

@@ -128,7 +128,8 @@ def work(
         tell(
             f"{task.name} does not repeat itself: with the same seed and actions it returns other numbers "
             f"{task.does_not_repeat}. So neither does the run: with other workers or after a resume it has other "
-            "numbers, and `verify` cannot judge it. The run records this"
+            "numbers, and `verify` cannot judge it. The run records this. `doctor` tries whether "
+            "task.new_object_each_episode mends it"
         )
     require_sound_state(store)
     state = driver.stored_state(store)

@@ -319,12 +319,24 @@ def test_a_report_shows_the_settings_of_a_run_whose_bounds_have_no_default(tmp_p
         ({"observation_size": 3}, "task.options.parameters"),
         ({"parameters": 10**10}, "task.options.parameters"),
         ({"parameters": 3, "descriptor_size": 10**9}, "task.options.descriptor_size"),
+        ({"parameters": 3, "start": [1.0, 2.0]}, "task.options.start"),
+        ({"parameters": 2, "start": [1.0, 1e300]}, "task.options.start"),
+        ({"observation_size": 3, "action_size": 1, "start": []}, "task.options.start"),
     ],
 )
 def test_episodes_without_a_size_or_with_too_large_a_one_are_refused(options, field):
     with pytest.raises(ConfigError) as caught:
         load_config(config_of(task={"environment": "caller", "options": options}))
     assert {problem.field for problem in caught.value.problems} == {field}
+
+
+def test_a_search_begins_at_the_start_that_the_caller_gives(tmp_path):
+    start = [3.0, -1.0, 0.5, 10]
+    task = {"environment": "caller", "options": {"parameters": 4, "start": start}}
+    with ask_tell(config_of("es", task=task), tmp_path / "run") as search:
+        asked = search.ask()
+    assert asked is not None
+    np.testing.assert_allclose(asked.parameters.mean(axis=0), start, atol=1e-6)  # of pairs, or of the centre
 
 
 @pytest.mark.slow

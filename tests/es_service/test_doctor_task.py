@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import jax.numpy as jnp
 import pytest
+from typer.testing import CliRunner
 
 from es_service import api
-from es_service.cli.doctor import print_findings
 from es_service.cli.doctor_task import task_findings
+from es_service.cli.main import app
 from es_service.errors import ConfigError
 from es_service.protocol.noise import uniforms
 from es_service.runs.checked_config import load_config
@@ -84,13 +86,18 @@ def test_what_simd_would_hide_is_a_failure_and_refused_before_a_run():
 
 
 @pytest.mark.slow
-def test_a_task_that_does_not_repeat_is_told_from_one_that_does(monkeypatch, capsys):
+def test_tasks_that_do_not_repeat_are_told_from_one_that_does_with_what_mends_it(monkeypatch):
     monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
-    *_, (level, repeats), _ = findings(f"python:{MODULE}:Forgetful")
+    forgetful, fragile = (f"python:{MODULE}:{name}" for name in ("Forgetful", "Fragile"))
+    *_, (level, repeats), (_, mended), _ = findings(forgetful)
     assert level == "note"
     assert "it returns other numbers after another episode, so" in repeats
-    assert not print_findings(task_findings(f"python:{MODULE}:Fragile"), as_json=True)
-    assert "the fifth step cannot be done" in capsys.readouterr().out
+    assert "With task.new_object_each_episode=true each episode has a new object, and it repeats bit for bit" in mended
+    result = CliRunner().invoke(app, ["doctor", fragile, f"python:{MODULE}:Drift", "--json"])
+    assert result.exit_code == 1
+    said = [(finding["level"], finding["text"]) for finding in json.loads(result.stdout)]
+    assert any(level == "FAIL" and fragile in text and "the fifth step cannot be done" in text for level, text in said)
+    assert any("it repeats bit for bit" in text for _, text in said)
 
 
 def test_tasks_in_jax_repeat_and_what_is_no_task_is_named():

@@ -21,7 +21,7 @@ from es_service.cli.commands import error_message
 from es_service.cli.main import app
 from es_service.config.given import parse_overrides
 from es_service.config.text import dump_yaml
-from es_service.errors import ConfigError, EvaluationError
+from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.protocol.sources import driver_sources, worker_sources
 from es_service.runs import jobs
 from es_service.runs.job_package import CONFIG as SENT_CONFIG
@@ -222,7 +222,7 @@ class Cluster:
     """Ray's client, for a job that ends after a while, and a clock that only sleeping moves."""
 
     def __init__(self, monkeypatch, ends_s: float) -> None:
-        self.now_s, self.ends_s, self.clients = 0.0, ends_s, 0
+        self.now_s, self.ends_s, self.clients, self.sent = 0.0, ends_s, 0, []
         clock = SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep)
         monkeypatch.setattr(jobs, "time", clock)
         monkeypatch.setattr(jobs, "_client", self.client)
@@ -236,6 +236,14 @@ class Cluster:
 
     def get_job_status(self, job: str) -> SimpleNamespace:
         return SimpleNamespace(value="RUNNING" if self.now_s < self.ends_s else "STOPPED")
+
+    def list_jobs(self) -> list[SimpleNamespace]:
+        state, metadata = self.get_job_status("es-1"), {jobs.FOLDER: "/runs/x"}
+        return [SimpleNamespace(submission_id="es-1", status=state, metadata=metadata, start_time=1)]
+
+    def submit_job(self, submission_id: str, **job: Any) -> str:
+        self.sent.append(job)
+        return submission_id
 
     def stop_job(self, job: str) -> None:
         pass
@@ -252,6 +260,16 @@ def test_a_log_is_followed_piece_by_piece_and_a_lost_connection_is_told(monkeypa
     assert [next(pieces), next(pieces)] == ["one\n", "two\n"]
     with pytest.raises(EvaluationError, match="request to http://head:8265 failed: the connection closed"):
         next(pieces)
+
+
+def test_a_folder_that_a_running_job_writes_to_is_refused_before_anything_is_sent(monkeypatch):
+    cluster, package = Cluster(monkeypatch, ends_s=3.0), run_package(CONFIG, "/runs/x/")
+    with pytest.raises(StoreError, match="the job es-1, which is RUNNING, has the folder /runs/x/, too; choose"):
+        jobs.submit(package, "http://head:8265")
+    assert not cluster.sent
+    cluster.now_s = 4.0
+    assert jobs.submit(package, "http://head:8265").startswith("es-")
+    assert len(cluster.sent) == 1
 
 
 def test_a_job_is_stopped_and_waited_for_over_one_connection(monkeypatch):

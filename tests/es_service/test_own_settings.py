@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import sys
 
 import pytest
 
 from es_service import api
+from es_service.config import search
 from es_service.config.text import parse_value
 from es_service.errors import ConfigError
 from es_service.report.settings import changed_settings
@@ -173,3 +176,14 @@ def test_a_search_whose_keys_have_changed_since_the_config_was_loaded_is_refused
     with pytest.raises(ConfigError, match="the settings of the search kinds_of_keys:search have changed since this"):
         api.run(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_language_server_knows_the_keys_of_methods_that_perturb_centres():
+    """They are declared for it in SearchConfig, since that is the type of `config.search`."""
+    of_search = ast.parse(inspect.getsource(search.SearchConfig)).body[0]
+    assert isinstance(of_search, ast.ClassDef)
+    (declared,) = (part.body for part in of_search.body if isinstance(part, ast.If))
+    names = {
+        part.target.id for part in declared if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name)
+    }
+    assert names == search.PopulationConfig.model_fields.keys() - search.SearchConfig.model_fields.keys()

@@ -143,6 +143,8 @@ NOT_MEASURED = {
     "search.allow_infeasible": "is about results of -inf, which `test_policies.py` has",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
     "task.descriptor": "is for tasks of Python objects; `test_gymnasium.py` has it",
+    "task.success": "is for tasks of Python objects; `test_gymnasium.py` has it",
+    "task.new_object_each_episode": "is for tasks of Python objects; `test_host.py` has it",
     "task.time_limit_s": "is for tasks of Python objects and functions; `test_host.py` and `test_functions.py` have it",
     "policy.memory": "needs XLA; `test_policy_kinds.py` has it",
     "compute.rollout": "the other one is XLA",

@@ -134,8 +134,8 @@ class Told(tasks.Tasks):
     def __init__(self, point_maze):
         self.point_maze = point_maze
 
-    def chosen(self, name, options, descriptor):
-        return self.point_maze if name == "point_maze" else super().chosen(name, options, descriptor)
+    def chosen(self, name, options, choices):
+        return self.point_maze if name == "point_maze" else super().chosen(name, options, choices)
 
 
 def test_another_descriptor_is_refused(tmp_path, monkeypatch):

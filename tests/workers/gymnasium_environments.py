@@ -66,6 +66,30 @@ class Still(Unseen):
     observation_space, action_space = spaces.Discrete(2), spaces.Box(0.0, 1.0, (0,))
 
 
+class Parts(Reach):
+    """Its observation has parts, also inside of others, and its info says by 1.0 that it has arrived."""
+
+    observation_space = spaces.Dict(
+        {
+            "pose": spaces.Dict({"place": spaces.Box(-2.0, 2.0, (2, 1), np.float64), "far": spaces.MultiBinary(2)}),
+            "leg": spaces.Tuple((spaces.Discrete(3, start=5), spaces.Box(0.0, 1.0, (1,)))),
+        }
+    )
+
+    def _seen(self, place):
+        far = (place[:, 0] < -0.5).astype(np.int8)
+        return {"pose": {"place": place, "far": far}, "leg": (5 + self.steps % 3, np.array([0.25], np.float32))}
+
+    def reset(self, *, seed=None, options=None):
+        place, info = super().reset(seed=seed)
+        return self._seen(place), info
+
+    def step(self, action):
+        place, reward, terminated, truncated, info = super().step(action)
+        return self._seen(place), reward, terminated, truncated, {"arrived": float(info["is_success"])}
+
+
+gymnasium.register("tests/Parts-v0", Parts, max_episode_steps=25)
 gymnasium.register("tests/Unseen-v0", Unseen)
 gymnasium.register("tests/Still-v0", Still)
 gymnasium.register("tests/Reach-v0", Reach, max_episode_steps=25)

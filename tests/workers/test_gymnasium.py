@@ -11,14 +11,16 @@ from es_service.config.tasks import TASKS, task_of
 from es_service.config.text import parse_value
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError
-from es_service.protocol.messages import EvaluationChunk
+from es_service.protocol.messages import EvaluationChunk, HostChoices
 from es_service.protocol.noise import evaluation_reset_keys
 from es_service.protocol.options import defaults_of
 from es_service.protocol.sources import user_path, user_sources
 from es_service.runs.replay import record
 from es_service.runs.snapshot import Policy
 from tests.helpers import centre, random_parameters, spec
-from workers.environments import TaskError, describe_environment, gymnasium_task
+from tests.workers.gymnasium_environments import Reach
+from workers.environments import TaskError, describe_environment, gymnasium_task, make_host_task
+from workers.environments.host_task import HostEnvironment
 from workers.worker import make_worker
 
 MODULE = "tests.workers.gymnasium_environments"
@@ -255,8 +257,16 @@ def test_an_argument_that_a_run_decides_is_refused_with_the_key_that_does():
     ("name", "problem"),
     [
         ("gymnasium:CartPol-v1", r"is not registered in Gymnasium .*; did you mean gymnasium:CartPole-v1\?"),
-        (f"gymnasium:{MODULE}:tests/Words-v0", r"has observations of the space Text.*; Box and Discrete are supported"),
+        (
+            f"gymnasium:{MODULE}:tests/Words-v0",
+            r"has observations of the space Text.*; Box, Discrete, .* are supported",
+        ),
         (f"gymnasium:{MODULE}:tests/Pairs-v0", r"has actions of the space MultiDiscrete.*; Box and Discrete are"),
+        (f"gymnasium:{MODULE}:tests/Parts-v0", r"the order leg, pose, are .* task.options.flatten_observation=true"),
+        (
+            "gymnasium:FetchReach-v4",
+            "is not registered .* a module registers it, name this module: gymnasium:MODULE:FetchReach-v4",
+        ),
         (f"gymnasium:{MODULE}:tests/Unseen-v0", "has observations of the space Box.*, which are empty"),
         (f"gymnasium:{MODULE}:tests/Still-v0", "has actions of the space Box.*, which are empty"),
         ("gymnasium:no_such_module:Name-v0", "no_such_module"),
@@ -265,6 +275,41 @@ def test_an_argument_that_a_run_decides_is_refused_with_the_key_that_does():
 def test_what_cannot_be_a_task_is_named(name, problem):
     with pytest.raises(TaskError, match=problem):
         describe_environment(name)
+
+
+PARTS = f"gymnasium:{MODULE}:tests/Parts-v0"
+FLATTENED = {"options": {"flatten_observation": True}}
+
+
+def test_the_parts_of_an_observation_are_flattened_in_the_order_of_their_sorted_keys():
+    task = task_of(load_config(config_of(PARTS, descriptor=[7], **FLATTENED)))
+    assert (task.observation_size, task.descriptor_bounds) == (8, ((-2.0, 2.0),))
+    environment, by_hand = HostEnvironment(make_host_task(PARTS, FLATTENED["options"])), Reach()
+    (x,), (y,) = by_hand.reset(seed=3)[0]
+    far = [float(number < -0.5) for number in (x, y)]
+    assert environment.reset(3).tolist() == pytest.approx([1, 0, 0, 0.25, *far, x, y])
+    (x,), (y,) = by_hand.step(np.array([[0.1, 0.2]]))[0]
+    far = [float(number < -0.5) for number in (x, y)]
+    assert environment.step(np.array([[0.1, 0.2]]))[0].tolist() == pytest.approx([0, 1, 0, 0.25, *far, x, y])
+    with pytest.raises(ConfigError, match=r"flatten_observation = true: .* has observations of one part"):
+        load_config(config_of(REACH, **FLATTENED))
+
+
+def test_a_config_chooses_the_key_of_info_that_says_whether_an_episode_has_succeeded():
+    assert task_of(load_config(config_of(PARTS, **FLATTENED))).success == ""
+    task = task_of(load_config(config_of(PARTS, success="arrived", **FLATTENED)))
+    assert task.success == "the info of the last step has a true arrived"
+    assert not task.notes
+    environment = HostEnvironment(make_host_task(PARTS, FLATTENED["options"], HostChoices(success="arrived")))
+    environment.reset(3)
+    near = []
+    for _ in range(25):
+        place_2 = environment.step(np.array([[0.1, 0.1]]))[0][-2:]
+        near.append(bool(np.abs(place_2 - 1.0).max() < 0.2))
+        assert environment.success() is near[-1]
+    assert {*near} == {False, True}
+    (note,) = task_of(load_config(config_of(PARTS, success="there", **FLATTENED))).notes
+    assert "task.success = there: the info of the first steps has arrived; without this key, no" in note
 
 
 @pytest.mark.parametrize(

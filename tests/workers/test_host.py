@@ -17,7 +17,7 @@ from es_service.config.tasks import TASKS, task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.messages import NO_CHOICES, EvaluationChunk, HostChoices, PolicySpec, TrainingChunk
 from es_service.protocol.noise import (
     NORMAL_STD,
     Domain,
@@ -26,6 +26,7 @@ from es_service.protocol.noise import (
     stream_keys,
     uniforms,
 )
+from es_service.protocol.options import defaults_of
 from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.replay import record
@@ -500,6 +501,40 @@ def test_one_end_may_be_a_bool_or_a_number_of_any_library(monkeypatch):
         assert environment.step(0.0)[2] is True, end
 
 
+def test_a_new_object_for_each_episode_carries_nothing_over_and_old_ones_are_closed():
+    """An object that goes on with the random numbers of the episode before has other numbers only with one object."""
+    name, closed = f"python:{host_tasks.__name__}:Forgetful", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host_tasks.Forgetful, "close", lambda closing: closed.append(closing), raising=False)
+        for is_new in (False, True):
+            environment = HostEnvironment(make_host_task(name, {}, HostChoices(new_objects=is_new)))
+            first, _, again = environment.reset(1), environment.step(0.3 * np.ones(1)), environment.reset(1)
+            assert np.array_equal(first, again)
+            steps = [environment.step(0.3 * np.ones(1))[0]]
+            alone = HostEnvironment(make_host_task(name, {}))
+            alone.reset(1)
+            assert np.array_equal(steps[0], alone.step(0.3 * np.ones(1))[0]) is is_new
+            assert len(closed) == is_new
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_chunks_of_objects_that_carry_something_over_have_the_same_bits_in_any_order_if_objects_are_new(is_new):
+    task = TASKS[f"python:{MODULE}:Forgetful"]
+    worker_spec = spec(
+        environment=task.name,
+        environment_options=defaults_of(task.options),
+        choices=HostChoices(new_objects=is_new),
+        policy=PolicySpec((3, 4, 1)),
+        episode_steps=10,
+        rollout="host",
+    )
+    subject = centre(random_parameters(0, worker_spec.policy.parameters), observation_size=3)
+    first, second = ((subject, EvaluationChunk(1, number, episodes=2)) for number in range(2))
+    [one, other], [later, sooner] = make_worker(worker_spec)([first, second]), make_worker(worker_spec)([second, first])
+    assert np.array_equal(one.fitness, sooner.fitness) is is_new
+    assert np.array_equal(other.fitness, later.fitness) is is_new
+
+
 class Aliased(host_tasks.Drift):
     """Its descriptor is an array that it goes on changing, and it changes its actions."""
 
@@ -545,7 +580,7 @@ class Halving(host_tasks.Drift):
 def test_a_task_that_changes_its_actions_in_place_repeats_itself():
     name = f"python:{__name__}:Halving"
     task = describe_environment(name)
-    assert len(set(examine(task, {}, 0.0).hashes.values())) == 1
+    assert len(set(examine(task, {}, NO_CHOICES, 0.0).hashes.values())) == 1
     assert does_not_repeat(task, {}) == ""
 
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.errors import TaskError as TaskError
-from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.options import OptionValue, choice
 from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, SUITES, meant_environment
 from workers.viewer import Viewer
@@ -174,41 +174,48 @@ def make_function_task(name: str, options: Mapping[str, OptionValue]) -> Functio
 
 
 def make_host_task(
-    name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None = None, descriptor_size: int = 0
+    name: str, options: Mapping[str, OptionValue], choices: HostChoices = NO_CHOICES, descriptor_size: int = 0
 ) -> HostTask:
     """A task of Python objects; imports its module, but no JAX.
 
     Args:
         name: `python:package.module:Class`, or `gymnasium:ID`.
         options: options of the task and their values.
-        descriptor, descriptor_size: the descriptor that the config chooses, and how many numbers it has; None for that
-            of the task.
+        choices: what a config chooses besides.
+        descriptor_size: how many numbers the descriptor has that it chooses.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
     from workers.environments.host_descriptors import with_descriptor
+    from workers.environments.host_task import with_choices
 
     kind, _, rest = name.partition(":")
     if kind == LIBRARY:
-        from workers.environments import gymnasium_task
-
-        return with_descriptor(gymnasium_task.make(rest, options), descriptor, descriptor_size)
-    from workers.environments import python_task
-
-    return with_descriptor(python_task.make(rest, options), descriptor, descriptor_size)
+        from workers.environments import gymnasium_task as module
+    else:
+        from workers.environments import python_task as module
+    return with_descriptor(with_choices(module.make(rest, options), choices), choices.descriptor, descriptor_size)
 
 
-def settings_of_description(
-    name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None
-) -> dict[str, Any]:
+def settings_of_description(name: str, options: Mapping[str, OptionValue], choices: HostChoices) -> dict[str, Any]:
     """The choices of a config without which a task cannot be described, as plain data; none for most tasks."""
     settings: dict[str, Any] = {}
     if name.startswith(f"{LIBRARY}:"):
         settings["options"] = dict(options)
-    if is_host_task(name) and descriptor is not None:
-        settings["descriptor"] = descriptor if isinstance(descriptor, str) else list(descriptor)
+    if is_host_task(name):
+        settings |= {key: value for key, value in vars(choices).items() if value != getattr(NO_CHOICES, key)}
     return settings
+
+
+def choices_of(settings: Mapping[str, Any]) -> HostChoices:
+    """The choices among `settings_of_description`, also as JSON has them."""
+    descriptor = settings.get("descriptor")
+    return HostChoices(
+        tuple(descriptor) if isinstance(descriptor, list) else descriptor,
+        settings.get("success"),
+        settings.get("new_objects", False),
+    )
 
 
 def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:
@@ -234,15 +241,13 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
     if kind in SUITES:
         return importlib.import_module(f"workers.environments.{kind}_task").describe(rest, options)
     if is_host_task(name):
-        chosen = settings.get("descriptor")
-        descriptor = tuple(chosen) if isinstance(chosen, list) else chosen
         if kind == LIBRARY:
             from workers.environments import gymnasium_task
 
-            return gymnasium_task.describe(rest, options, descriptor)
+            return gymnasium_task.describe(rest, options, choices_of(settings))
         from workers.environments import python_task
 
-        return python_task.describe(rest, descriptor, options)
+        return python_task.describe(rest, choices_of(settings), options)
     if is_function_task(name):
         from workers.environments import function_task
 

@@ -4,7 +4,8 @@ An ID may have the module that registers it before it, `gymnasium:package.module
 that is the name of a module, that module is imported. Ours have the namespace `es_service`. Observations are those of a
 Box, flattened, or of a Discrete, one number for each value; actions those of a Box, between whose bounds the actions of
 a policy are put, or of a Discrete, among which the policy chooses. `task.options` are keyword arguments of
-`gymnasium.make`.
+`gymnasium.make`, and FLATTENED: with it, observations may be a Dict or a Tuple, also of such. They are then the numbers
+of all parts, keys of a Dict sorted, row by row, as float32.
 
 An episode ends where the environment says that it is terminated or truncated, or after `task.episode_steps`; the time
 limit that Gymnasium adds is left out, and its number of steps is the default. The checks that Gymnasium adds to each
@@ -28,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.messages import HostChoices, TaskSpec
 from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.raised import users_error, why_not_imported
 from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE, user_path
@@ -36,21 +37,23 @@ from es_service.protocol.user_code import import_user_module
 from workers.environments import TaskError
 from workers.environments.host_descriptors import describe_descriptor
 from workers.environments.host_task import (
-    IS_SUCCESS,
     LENGTH,
-    SUCCESS_OF_INFO,
     HostTask,
     action_bounds,
     chosen,
     length,
     said_success,
+    success_in_words,
     try_out,
+    with_choices,
     within_bounds,
 )
 from workers.host.seeds import KeyedGenerator, seed_of
 
 EPISODE_STEPS = 1000
 """Default length of an episode where the environment has no limit."""
+FLATTENED = "flatten_observation"
+"""Option of this project, no argument of `gymnasium.make`."""
 OURS = {
     "max_episode_steps": "the length of an episode is the key task.episode_steps; set that instead",
     "disable_env_checker": "the checks that Gymnasium adds to each step are left out in every run; leave it out",
@@ -58,17 +61,17 @@ OURS = {
 """Arguments of `gymnasium.make` that a run decides, each with what to do instead."""
 
 
-def describe(name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
+def describe(name: str, options: Mapping[str, OptionValue], choices: HostChoices) -> TaskSpec:
     """Description of the environment with the ID `name`.
 
     Args:
         options: keyword arguments of `gymnasium.make`.
-        descriptor: the descriptor that the config chooses; None for the length of an episode.
+        choices: what the config chooses besides.
 
     Raises:
         TaskError: there is no such environment, it cannot be made, or its spaces are not supported.
     """
-    task, spec = make(name, options), _registered(name)
+    task, spec = with_choices(make(name, options), choices), _registered(name)
     made = task.make()
     observations, actions = made.observation_space, made.action_space
     size = int(actions.n) if _is(actions, "Discrete") else int(np.prod(actions.shape))
@@ -80,8 +83,9 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
         raise _refused(task.name, "do a step", options, error.__cause__) from error
     steps = spec.max_episode_steps or EPISODE_STEPS
     names, bounds = (LENGTH,), ((0.0, float(steps)),)
-    if descriptor is not None:
-        names, bounds = describe_descriptor(task, descriptor, _bounds(observations), size)
+    if choices.descriptor is not None:
+        names, bounds = describe_descriptor(task, choices.descriptor, _bounds(observations), size)
+    success, notes = success_in_words(choices, told)
     return TaskSpec(
         name=task.name,
         observation_size=task.observation_size,
@@ -93,7 +97,8 @@ def describe(name: str, options: Mapping[str, OptionValue], descriptor: Descript
         has_goal=False,
         options=_options(made, spec, options),
         summary=f"{type(made.unwrapped).__name__} of Gymnasium",
-        success=SUCCESS_OF_INFO if IS_SUCCESS in told else "",
+        success=success,
+        notes=notes,
         kind="python",
         discrete_actions=_is(actions, "Discrete"),
         action_bounds=() if _is(actions, "Discrete") else action_bounds(_pairs(actions), size),
@@ -106,15 +111,19 @@ def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
     if wrong := [f"task.options.{key} = {options[key]!r}: {why}" for key, why in OURS.items() if key in options]:
         raise TaskError("; ".join(wrong))
     spec.order_enforce = False  # a wrapper that would check the order of calls
+    arguments = {key: value for key, value in options.items() if key != FLATTENED}
 
     def construct() -> Any:
         try:
-            return gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **options)
+            return gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **arguments)
         except Exception as error:  # the environment's code can raise anything
-            raise _refused(task, "be made", options, error) from error
+            raise _refused(task, "be made", arguments, error) from error
 
     environment = construct()
-    size, flat = _observed(task, environment.observation_space)
+    if options.get(FLATTENED) and _keys(environment.observation_space) is None:
+        why = f"{task} has observations of one part, {environment.observation_space}; leave it out"
+        raise TaskError(f"task.options.{FLATTENED} = true: {why}")
+    size, flat = _observed(task, environment.observation_space, flattened=options.get(FLATTENED) is True)
     return HostTask(
         name=task,
         make=construct,
@@ -173,6 +182,8 @@ def _registered(name: str) -> Any:
     except gymnasium.error.Error as error:
         near = get_close_matches(environment, gymnasium.registry, 1, 0.5)
         hint = f"; did you mean {LIBRARY}:{near[0]}?" if near else ""
+        if ":" not in name:
+            hint += f"; if the import of a module registers it, name this module: {LIBRARY}:MODULE:{environment}"
         raise TaskError(f"{LIBRARY}:{name} is not registered in Gymnasium ({error}){hint}") from error
 
 
@@ -187,17 +198,37 @@ def _is(space: Any, kind: str) -> bool:
     return isinstance(space, getattr(gymnasium_package().spaces, kind))
 
 
-def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:
+def _observed(task: str, space: Any, *, flattened: bool) -> tuple[int, Callable[[Any], Any]]:
     """(size of an observation, function from an observation to numbers)."""
-    if _is(space, "Box"):
+    if _is(space, "Box") or _is(space, "MultiBinary"):
         return _size(task, "observations", space), lambda observation: observation
     if _is(space, "Discrete"):
         values = np.arange(space.n) + space.start
         return int(space.n), lambda observation: values == observation
-    raise TaskError(
-        f"{task} has observations of the space {space}; Box and Discrete are supported. Register the environment with "
-        "a wrapper that makes a Box of them, such as gymnasium.wrappers.FlattenObservation"
-    )
+    if (keys := _keys(space)) is None:
+        raise TaskError(
+            f"{task} has observations of the space {space}; Box, Discrete, MultiBinary, Dict and Tuple of these are "
+            "supported. Register the environment with a wrapper that makes a Box of them, such as "
+            "gymnasium.wrappers.FlattenObservation"
+        )
+    if not flattened:
+        raise TaskError(
+            f"{task} has observations of the space {space}, which has several parts. The numbers of all of them, in "
+            f"the order {', '.join(map(str, keys))}, are the observation with task.options.{FLATTENED}=true"
+        )
+    parts = [(key, *_observed(task, space[key], flattened=True)) for key in keys]
+
+    def flat(observation: Any) -> Any:
+        return np.concatenate([np.asarray(of(observation[key]), np.float32).reshape(-1) for key, _, of in parts])
+
+    return sum(size for _, size, _ in parts), flat
+
+
+def _keys(space: Any) -> list[Any] | None:
+    """Keys of the parts of a Dict, sorted, or of a Tuple; None for any other space."""
+    if _is(space, "Dict"):
+        return sorted(space.keys())
+    return [*range(len(space.spaces))] if _is(space, "Tuple") else None
 
 
 def _acted(task: str, space: Any) -> Callable[[Any], Any]:
@@ -229,6 +260,10 @@ def _size(task: str, what: str, box: Any) -> int:
 
 def _bounds(space: Any) -> list[tuple[float, float]]:
     """Bounds of each number of a flat observation."""
+    if (keys := _keys(space)) is not None:
+        return [pair for key in keys for pair in _bounds(space[key])]
+    if _is(space, "MultiBinary"):
+        return [(0.0, 1.0)] * int(np.prod(space.shape))
     if _is(space, "Discrete"):
         return [(0.0, 1.0)] * int(space.n)
     low_O, high_O = ([float(str(number)) for number in bound.reshape(-1)] for bound in (space.low, space.high))
@@ -241,6 +276,8 @@ def _options(made: Any, spec: Any, given: Mapping[str, OptionValue]) -> dict[str
     parameters = [*inspect.signature(type(made.unwrapped).__init__).parameters.values()][1:]
     named = [one for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
     defaults = {one.name: one.default for one in named} | spec.kwargs
+    if _keys(made.observation_space) is not None:
+        defaults[FLATTENED] = False
     plain = {name: value if type(value) in (bool, int, float, str) else None for name, value in defaults.items()}
     for name, value in given.items():
         if plain.get(name) is None or (type(plain[name]), type(value)) == (int, float):

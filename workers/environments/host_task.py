@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from textwrap import shorten
 from typing import Any
@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import Bounds, FloatArray
+from es_service.protocol.messages import Bounds, FloatArray, HostChoices
 from es_service.protocol.raised import raised
 from workers.environments import TaskError
 
 IS_SUCCESS = "is_success"
-"""Key of `info` that says whether an episode has succeeded."""
-SUCCESS_OF_INFO = f"the info of the last step has a true {IS_SUCCESS}"
+"""Key of `info` that says whether an episode has succeeded, if a config chooses no other."""
 TRIED_STEPS = 3
 """Steps that are done with a new task, to see what its object returns."""
 LENGTH = "length"
@@ -76,6 +75,8 @@ class HostTask:
     as far as the object can draw it; None if it takes nothing but a seed."""
     keeps_all: bool = False
     """Whether `HostEpisode` has all observations and rewards."""
+    new_objects: bool = False
+    """Whether each episode has a new object, so that nothing is carried over from one to the next."""
 
 
 CONTRACTS = {
@@ -98,6 +99,7 @@ class HostEnvironment:
         self._require_arguments("reset", "an argument named seed", seed=0)
         self._require_arguments("step", "an action", 0)
         self._episode = HostEpisode(self._object, np.zeros(0, np.float32))
+        self._is_new = True
         self.first_observation_O = self._episode.observation_O
         """Observation [O] with which the present episode began."""
 
@@ -107,6 +109,12 @@ class HostEnvironment:
         Args:
             key: stream key with whose noise the object draws the start if it can; None: with the seed alone.
         """
+        if self._task.new_objects and not self._is_new:
+            closes = getattr(self._object, "close", None)
+            if callable(closes):
+                closes()
+            self._object = self._task.make()
+        self._is_new = False
         if key is None or self._task.reset_by_key is None:
             result = self._object.reset(seed=seed)
         else:
@@ -220,6 +228,29 @@ def length(episode: HostEpisode) -> float:
 def said_success(episode: HostEpisode) -> bool:
     """Whether the newest `info` says that the episode has succeeded."""
     return bool(episode.info.get(IS_SUCCESS, False))
+
+
+def with_choices(task: HostTask, choices: HostChoices) -> HostTask:
+    """The task with what a config chooses of it, but for the descriptor."""
+    success = task.success
+    if (key := choices.success) is not None:
+        success = lambda episode: episode.info.get(key, False)  # noqa: E731
+    return replace(task, success=success, new_objects=choices.new_objects)
+
+
+def success_in_words(choices: HostChoices, told: Collection[str], own: str = "") -> tuple[str, tuple[str, ...]]:
+    """Which episodes succeed, empty if the task does not tell; and what the author of a config should know of it.
+
+    Args:
+        told: keys of the `info` of the first steps.
+        own: which succeed as the task itself says.
+    """
+    chosen = choices.success
+    if chosen is None and (own or IS_SUCCESS not in told):
+        return own, ()
+    key, has = chosen or IS_SUCCESS, ", ".join(map(str, sorted(told, key=str))) or "no keys"
+    note = f"task.success = {key}: the info of the first steps has {has}; without this key, no episode succeeds"
+    return f"the info of the last step has a true {key}", () if key in told else (note,)
 
 
 def try_out(task: HostTask, action_size: int) -> set[str]:

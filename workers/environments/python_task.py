@@ -33,7 +33,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
 from workers.environments import TaskError
 from workers.environments.declared import (
@@ -49,16 +49,16 @@ from workers.environments.declared import (
 )
 from workers.environments.host_descriptors import describe_descriptor
 from workers.environments.host_task import (
-    IS_SUCCESS,
     LENGTH,
-    SUCCESS_OF_INFO,
     HostTask,
     action_bounds,
     chosen,
     length,
     said_success,
+    success_in_words,
     try_out,
     unchanged,
+    with_choices,
     within_bounds,
 )
 
@@ -73,12 +73,12 @@ PREFIX = "python:"
 
 
 def describe(
-    path: str, descriptor: DescriptorChoice | None = None, given: Mapping[str, OptionValue] = MappingProxyType({})
+    path: str, choices: HostChoices = NO_CHOICES, given: Mapping[str, OptionValue] = MappingProxyType({})
 ) -> TaskSpec:
     """Description of a user's class as a task.
 
     Args:
-        descriptor: the descriptor that the config chooses; None for that of the class.
+        choices: what the config chooses.
         given: values of options that are not the defaults, with which its methods are tried.
 
     Raises:
@@ -107,20 +107,19 @@ def describe(
     if wrong:
         raise TaskError(f"{name}: {'; '.join(wrong)}")
     spec = task_of_class(name, task, "python", (names, bounds), options)
-    made = make(path, option_values(options, given))
-    told = try_out(made, task.action_size)
-    if not spec.success and IS_SUCCESS in told:
-        spec = replace(spec, success=SUCCESS_OF_INFO)
-    if descriptor is not None:
+    made = with_choices(make(path, option_values(options, given)), choices)
+    success, about_success = success_in_words(choices, try_out(made, task.action_size), spec.success)
+    if choices.descriptor is not None:
         no_bounds = [(-math.inf, math.inf)] * task.observation_size
-        names, bounds = describe_descriptor(made, descriptor, no_bounds, task.action_size)
+        names, bounds = describe_descriptor(made, choices.descriptor, no_bounds, task.action_size)
         spec = replace(spec, descriptor_names=names, descriptor_bounds=bounds)
-    notes = unknown_attributes(name, task, KNOWN)
+    notes = (*unknown_attributes(name, task, KNOWN), *about_success)
     limits = getattr(task, "action_bounds", None)
     return replace(
         spec,
         discrete_actions=bool(getattr(task, "discrete_actions", False)),
         action_bounds=() if limits is None else action_bounds(limits, task.action_size),
+        success=success,
         notes=notes,
     )
 

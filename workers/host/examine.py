@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
+from es_service.protocol.messages import HostChoices, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.parent import end_soon, write_answer
@@ -28,7 +28,7 @@ from es_service.protocol.raised import raised
 from es_service.protocol.rollouts import choose
 from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
-from workers.environments import TaskError, make_function_task, make_host_task
+from workers.environments import TaskError, choices_of, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment
 from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
@@ -63,8 +63,8 @@ class Examined:
     """Of a task in JAX: the fields of `workers.step_cost.StepCost`."""
 
 
-def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) -> Examined:
-    """Examine a task that is described as `task`, with these options; at least one step is measured.
+def examine(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices, seconds: float) -> Examined:
+    """Examine a task that is described as `task`, with these options and choices; at least one step is measured.
 
     Raises whatever the code of the task raises.
     """
@@ -80,10 +80,13 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
     if task.kind == "jax":
         from workers.step_cost import step_cost
 
-        fault = _fault(task, options)
+        fault = _fault(task, options, choices)
         step = {} if fault else asdict(step_cost(task, options, seconds))
         return Examined({}, 0.0, peak_memory_mib(), fault, step)
-    made, key = make_host_task(task.name, options), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
+    made, key = (
+        make_host_task(task.name, options, choices, len(task.descriptor_names)),
+        stream_keys(0, Domain.ACTION_NOISE, 0, 0),
+    )
     coordinates = np.arange(STEPS * task.action_size, dtype=np.uint32)
     action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
     actions_T = made.actions(action_T_A.reshape(STEPS, task.action_size))
@@ -114,10 +117,10 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], seconds: float) 
     several = [HostEnvironment(made) for _ in range(1 + BESIDE)]
     hashes["beside other objects"] = episodes(several, [SEED, *range(OTHER_SEED, OTHER_SEED + BESIDE)])[0]
     measured = _measured(hashes, lambda: episodes([environment], [SEED])[1], seconds)
-    return replace(measured, fault=_fault(task, options))
+    return replace(measured, fault=_fault(task, options, choices))
 
 
-def _fault(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
+def _fault(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices) -> str:
     """See `Examined.fault`. The episodes are those of a worker, which knows what makes an episode invalid."""
     policy = PolicySpec((task.observation_size, 16, task.action_size))
     rollout = choose(BACKENDS, task, policy, gpu=False, here=True)
@@ -125,6 +128,8 @@ def _fault(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
         seed=SEED,
         environment=task.name,
         environment_options=dict(options),
+        choices=choices,
+        descriptor_size=0 if choices.descriptor is None else len(task.descriptor_names),
         policy=policy,
         episode_steps=min(STEPS, task.episode_steps),
         fitness="sum",
@@ -171,7 +176,7 @@ def main(name: str, settings: str, seconds: str, file: str) -> None:
         given = json.loads(settings)
         task = described(name, given)
         options = option_values(task.options, given.get("options", {}))
-        answer: dict[str, Any] = asdict(examine(task, options, float(seconds)))
+        answer: dict[str, Any] = asdict(examine(task, options, choices_of(given), float(seconds)))
     except TaskError as error:
         answer = {"problem": str(error)}
     except Exception as error:  # the user's code can raise anything

@@ -12,7 +12,7 @@ from copy import copy
 
 import numpy as np
 
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue
 from workers.environments import make_host_task
@@ -27,7 +27,7 @@ APART_S = 20.0
 SEED, OTHER_SEED = 1, 2
 
 
-def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
+def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices) -> str:
     """`does_not_repeat` in a copy of this process, which a simulator may end or make wait; empty if nothing was found.
 
     For a process with one thread. Whatever the simulator prints goes to stderr.
@@ -38,7 +38,7 @@ def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
         try:
             os.setsid()  # so that processes that the simulator starts end with it
             os.dup2(2, 1)
-            os.write(write, does_not_repeat(task, options).encode())
+            os.write(write, does_not_repeat(task, options, choices).encode())
         finally:
             os._exit(0)
     os.close(write)
@@ -53,13 +53,13 @@ def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
         os.waitpid(child, 0)
 
 
-def does_not_repeat(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
+def does_not_repeat(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices = NO_CHOICES) -> str:
     """Where the episode of a seed has other numbers than in a new object, in words; empty if nowhere.
 
     Tried are the same episode in an object that has had another one before, and in another new object. What is equal
     here may still differ in a longer episode, or in another process, which `es-service doctor TASK` tries.
     """
-    made = make_host_task(task.name, options)
+    made = make_host_task(task.name, options, choices, len(task.descriptor_names))
     coordinates, key = np.arange(STEPS * task.action_size, dtype=np.uint32), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
     action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
     actions_T = made.actions(action_T_A.reshape(STEPS, task.action_size))

@@ -107,7 +107,7 @@ def make_runner(spec: WorkerSpec) -> tuple[Callable[..., Episodes], Callable[[It
             return partial(run_calls, function, function, spec), lambda lanes: None
         caller = Caller(*given, spec.time_limit_s)
         return partial(run_calls, function, caller, spec), lambda lanes: caller.start()
-    described = spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size
+    described = spec.environment, spec.environment_options, spec.choices, spec.descriptor_size
     (task,) = [make_host_task(*described) for _ in progress.counted("making", described[:1])]
     lanes = Lanes(task)
     return partial(run_episodes, lanes, spec), lanes.of
