@@ -1,4 +1,4 @@
-"""Forces of the constraints of MuJoCo's models in JAX, of which few contacts are active at a time.
+"""Forces of the constraints of MuJoCo's models in JAX, which MJX finds more slowly and less exactly.
 
 MJX has a place for each contact that may be, and its solver computes the rows of all of them. C MuJoCo has rows only of
 active contacts, those of geoms nearer than their margin: Gymnasium's ant has 25 places, and in nearly all states four
@@ -17,14 +17,14 @@ from workers.environments.brax_parts import quietly
 
 with quietly():
     from mujoco import mjx
-    from mujoco.mjx._src import constraint, solver
+    from mujoco.mjx._src import collision_driver, constraint, math, solver, support, types
 
 AT_ONCE = 4
 """Active contacts of each `condim` that are solved without the places of the others, if there are more places."""
 
 
 def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:
-    """Data with the accelerations and the forces of the constraints, which `mjx.solver.solve` finds.
+    """Data with the accelerations and the forces of the constraints, which `mjx.solver.solve` looks for.
 
     The first `at_once` active contacts of each `condim` are solved without the other places. Only where more are
     active, all places are solved afterwards. Both solutions are the same but for rounding, since the rows of a contact
@@ -37,7 +37,7 @@ def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:
     groups = [np.flatnonzero(contact.dim == dim) for dim in np.unique(contact.dim)]
     counts = [min(at_once, len(group)) for group in groups]
     if not groups or len(contact.dim) < 2 * sum(counts):
-        return solver.solve(model, data)
+        return _converged(model, data)
     active = contact.dist < contact.includemargin
     numbers = [jnp.cumsum(active[group].astype(jnp.int32)) for group in groups]
     places = [_first(number, count) for number, count in zip(numbers, counts, strict=True)]
@@ -92,4 +92,74 @@ def _solve(model: mjx.Model, data: Any, contact: Any, dim: np.ndarray) -> Any:
     address = constraint.make_efc_address(model, dim, kinds)
     sizes = {"_impl.efc_type": kinds, "_impl.nefc": len(kinds), "_impl.ncon": len(dim)}
     contacts = {"_impl.contact": contact.replace(dim=dim, efc_address=address)}
-    return solver.solve(model, constraint.make_constraint(model, data.tree_replace(contacts | sizes)))
+    return _converged(model, constraint.make_constraint(model, data.tree_replace(contacts | sizes)))
+
+
+def _converged(model: mjx.Model, data: Any) -> Any:
+    """As `mjx.solver.solve`, with a step of Newton's method at the end, where float32 lets MJX end too early.
+
+    A line search takes a step only if the cost falls by it. In float32 the cost has seven digits, so near the minimum,
+    where it is flat, no step is seen to lower it, and accelerations may be wrong by 3e-4 of the greatest of them. The
+    gradient tells more: the next step is taken if the gradient is smaller after it. A search that has used all
+    iterations is left where it is, as in C MuJoCo.
+    """
+    if model.opt.solver != types.SolverType.NEWTON or model.opt.iterations == 1:
+        return solver.solve(model, data)
+
+    def at(qacc: Any) -> Any:
+        return solver.Context.create(model, data.replace(qacc=qacc), grad=False)
+
+    def turned(context: Any) -> Any:
+        context = solver._update_gradient(model, data, context)
+        return context.replace(search=-context.Mgrad)
+
+    def iteration(context: Any) -> Any:
+        context = solver._update_constraint(model, data, solver._linesearch(model, data, context))
+        return turned(context).replace(solver_niter=context.solver_niter + 1)
+
+    def goes_on(context: Any) -> Any:
+        change, slope = context.prev_cost - context.cost, math.norm(context.grad)
+        least = model.opt.tolerance * solver._trace_m(model, data)
+        return (context.solver_niter < model.opt.iterations) & (change >= least) & (slope >= least)
+
+    context = at(data.qacc_smooth)
+    if not model.opt.disableflags & types.DisableBit.WARMSTART:
+        warm = at(data.qacc_warmstart)
+        context = jax.tree.map(lambda x, y: jnp.where(warm.cost < context.cost, x, y), warm, context)
+    context = jax.lax.while_loop(goes_on, iteration, turned(context))
+    step = context.search
+    moved = context.replace(
+        qacc=context.qacc + step,
+        Ma=context.Ma + support.mul_m(model, data, step),
+        Jaref=context.Jaref + data._impl.efc_J @ step,
+    )
+    moved = solver._update_constraint(model, data, moved)
+    slope = math.norm(moved.Ma - data.qfrc_smooth - moved.qfrc_constraint)
+    is_nearer = (slope < math.norm(context.grad)) & (context.solver_niter < model.opt.iterations)
+    qacc, qfrc, force = (
+        jnp.where(is_nearer, getattr(moved, name), getattr(context, name))
+        for name in ("qacc", "qfrc_constraint", "efc_force")
+    )
+    return data.tree_replace({"qacc": qacc, "qfrc_constraint": qfrc, "_impl.efc_force": force})
+
+
+def feet_of(model: Any) -> list[int]:
+    """Bodies of an `MjModel` that have no children and can touch a floor, which is a plane of the world."""
+    floors, bodies = _floors(model), model.geom_bodyid
+    pairs = [(int(first), int(second)) for first, second, _ in collision_driver.geom_pairs(model)]
+    near = {int(bodies[other]) for pair in pairs for geom, other in (pair, pair[::-1]) if geom in floors}
+    return sorted(near - {*model.body_parentid.tolist()})
+
+
+def touching(model: Any, data: Any, feet: list[int]) -> Any:
+    """[F] 1 for each foot that has an active contact with a floor, which C MuJoCo would list, else 0."""
+    if not feet:
+        return jnp.zeros(0)
+    contact, floors = data._impl.contact, np.array(sorted(_floors(model)))
+    is_active, body_C_2 = contact.dist < contact.includemargin, jnp.asarray(model.geom_bodyid)[contact.geom]
+    is_of_floor = is_active & (contact.geom[:, :, None] == floors).any(axis=(1, 2))
+    return jnp.stack([(is_of_floor & (body_C_2 == foot).any(axis=1)).any() for foot in feet]).astype(jnp.float32)
+
+
+def _floors(model: Any) -> set[int]:
+    return {*np.flatnonzero((model.geom_type == types.GeomType.PLANE) & (model.geom_bodyid == 0)).tolist()}

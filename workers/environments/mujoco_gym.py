@@ -26,13 +26,16 @@ from workers.environments.brax_parts import quietly
 from workers.environments.c_mujoco import ControlStep
 from workers.environments.gymnasium_task import gymnasium_package
 from workers.environments.host_task import action_bounds
-from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, GymState, GymTask, Parts, Simulated
+from workers.environments.mujoco_contacts import feet_of, touching
+from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, Feet, GymState, GymTask, Parts, Simulated
 from workers.environments.mujoco_parts import MjModel, forward, mujoco, mujoco_viewer, put_model, start, step_and_look
 
 FAR = 30.0
 """Bound of descriptors whose range is not specified, in metres or in the unit of the joint."""
 JOINTS = 2
 """Most joints in the descriptor `final_joints`; they are the first joints of the model."""
+FEET = "feet_contact"
+"""The descriptor that is the share of control steps after which each foot touched the floor."""
 
 
 def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
@@ -95,26 +98,35 @@ def make(
     of = build(name, frame_skip, solver_iterations, **options)
     (model, mx, substeps, step_s), parts = of.simulated, of.parts
     descriptors = _descriptors(model)
-    *_, places = descriptors[descriptor or next(iter(descriptors))]
+    kind = descriptor or next(iter(descriptors))
+    *_, places = descriptors[kind]
+    feet = feet_of(model) if kind == FEET else []
     low_A, high_A = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
     middle_A, half_A = 0.5 * low_A + 0.5 * high_A, 0.5 * high_A - 0.5 * low_A
 
     def reset(key: Any) -> GymState:
-        return of.at(*parts.start(key))
+        return of.at(*parts.start(key))._replace(feet=Feet(jnp.zeros(len(feet)), jnp.float32(0.0)) if feet else None)
 
     def ctrl(action: Any) -> Any:
         return jnp.clip(middle_A + half_A * action, low_A, high_A)
 
     def step(state: GymState, action: Any) -> tuple[GymState, Any, Any]:
         bounded_A = ctrl(action)
-        after = GymState(*step_and_look(mx, state.physics, bounded_A, substeps, lambda data: parts.look(data, True)))
+        physics, (seen, touching_F) = step_and_look(
+            mx, state.physics, bounded_A, substeps, lambda data: (parts.look(data, True), touching(model, data, feet))
+        )
+        counts = Feet(state.feet.touched_F + touching_F, state.feet.steps + 1.0) if feet else None
+        after = GymState(physics, seen, counts)
         return after, *parts.outcome(state, after, bounded_A)
+
+    def describe_state(state: GymState) -> Any:
+        return state.feet.touched_F / jnp.maximum(state.feet.steps, 1.0) if feet else state.physics.qpos[places]
 
     return Environment(
         reset,
         parts.observe,
         step,
-        lambda state: state.physics.qpos[places],
+        describe_state,
         lambda state: jnp.float32(jnp.nan),
         viewer=mujoco_viewer(model, mx, step_s, lambda state: state.physics),
         control_step=ControlStep(model, substeps, lambda state: state.physics, ctrl),
@@ -192,13 +204,15 @@ def _range(key: str, value: Any) -> tuple[float, float]:
 def _descriptors(model: MjModel) -> dict[str, tuple[tuple[str, ...], Bounds, Any]]:
     """Descriptors of a model: name -> (names of the dimensions, bounds, their places among the positions).
 
-    The first is the default.
+    The first is the default. `FEET` has no places.
     """
     descriptors: dict[str, tuple[tuple[str, ...], Bounds, Any]] = {}
     root, along = _root(model)
     for kind, axes in (("final_xy", "xy"), ("final_x", "x")):
         if along[: len(axes)] == axes:
             descriptors[kind] = tuple(axes), ((-FAR, FAR),) * len(axes), np.arange(len(axes))
+    if feet := len(feet_of(model)):
+        descriptors[FEET] = tuple(f"foot_{number}" for number in range(1, feet + 1)), ((0.0, 1.0),) * feet, None
     if joints := min(JOINTS, model.nq - root):
         names = tuple(f"joint_{number}" for number in range(1, joints + 1))
         descriptors["final_joints"] = names, ((-FAR, FAR),) * joints, np.arange(root, root + joints)

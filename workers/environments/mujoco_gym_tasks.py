@@ -32,12 +32,23 @@ class Simulated(NamedTuple):
         return mujoco.mj_name2id(self.c, mujoco.mjtObj.mjOBJ_BODY, name)
 
 
+class Feet(NamedTuple):
+    """What the descriptor `feet_contact` counts."""
+
+    touched_F: Any
+    """Number of control steps after which each foot touched the floor."""
+    steps: Any
+    """Number of control steps."""
+
+
 class GymState(NamedTuple):
     """State of an environment of Gymnasium between two control steps."""
 
     physics: MujocoState
     seen: Any
     """What `look` of the task saw in the last computed substep, any pytree."""
+    feet: Feet | None = None
+    """None with descriptors that do not need it."""
 
 
 class Parts(NamedTuple):
@@ -89,7 +100,7 @@ def _ant(
         return data.xpos[main_body, :2], jnp.clip(forces, *contact_force_range)
 
     def observe(state: GymState) -> Any:
-        (qpos, qvel, *_), (_, forces) = state
+        (qpos, qvel, *_), (_, forces), *_ = state
         place = 2 if exclude_current_positions_from_observation else 0
         return jnp.concatenate([qpos[place:], qvel, *([forces[1:].ravel()] if include_cfrc_ext_in_observation else [])])
 
