@@ -105,7 +105,8 @@ def make(
     middle_A, half_A = 0.5 * low_A + 0.5 * high_A, 0.5 * high_A - 0.5 * low_A
 
     def reset(key: Any) -> GymState:
-        return of.at(*parts.start(key))._replace(feet=Feet(jnp.zeros(len(feet)), jnp.float32(0.0)) if feet else None)
+        counts = Feet(jnp.zeros(len(feet)), jnp.float32(0.0)) if feet else None
+        return of.at(*parts.start(key))._replace(feet=counts)
 
     def ctrl(action: Any) -> Any:
         return jnp.clip(middle_A + half_A * action, low_A, high_A)
@@ -115,12 +116,14 @@ def make(
         physics, (seen, touching_F) = step_and_look(
             mx, state.physics, bounded_A, substeps, lambda data: (parts.look(data, True), touching(model, data, feet))
         )
-        counts = Feet(state.feet.touched_F + touching_F, state.feet.steps + 1.0) if feet else None
+        counts = state.feet and Feet(state.feet.touched_F + touching_F, state.feet.steps + 1.0)
         after = GymState(physics, seen, counts)
         return after, *parts.outcome(state, after, bounded_A)
 
     def describe_state(state: GymState) -> Any:
-        return state.feet.touched_F / jnp.maximum(state.feet.steps, 1.0) if feet else state.physics.qpos[places]
+        if state.feet is None:
+            return state.physics.qpos[places]
+        return state.feet.touched_F / jnp.maximum(state.feet.steps, 1.0)
 
     return Environment(
         reset,
