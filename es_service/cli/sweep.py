@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from es_service.config.text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
 from es_service.protocol.system import given_path
 from es_service.runs.sweep import SweptRun, run_planned
+from es_service.runs.sweep_commands import Certifying
 from es_service.runs.sweep_plan import left_out_notes, plan
 from es_service.runs.trackers import check_trackers
 
@@ -57,6 +59,13 @@ def sweep(
     seeds: SeedsOption = None,
     set_: SetOption = None,
     parallel: ParallelOption = None,
+    certify: Annotated[bool, typer.Option("--certify", help="Certify each run at its end, as evaluate does.")] = False,
+    certify_at: Annotated[
+        str | None,
+        typer.Option(
+            "--certify-at", metavar="STEPS,...", help="Certify runs at these environment steps, too, and at the end."
+        ),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option("--workers", help="Workers of each run; default: an equal share of the cores.")
     ] = None,
@@ -69,7 +78,9 @@ def sweep(
     if not grid and seeds is None:
         raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, _options_of_each(log, log_level))
+    certifying = Certifying(steps_of(certify_at or "")) if certify or certify_at else None
+    options = _options_of_each(log, log_level)
+    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying)
 
 
 def run_seeds(
@@ -103,6 +114,7 @@ def run_sweep(
     seeds: str | None,
     parallel: int | None,
     options: Sequence[str],
+    certifying: Certifying | None = None,
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
     planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
@@ -111,7 +123,7 @@ def run_sweep(
         print_note(f"note: {note}")
     try:
         with show_sweep(console, errors, str(out)) as (show, note):
-            runs = run_planned(planned, out, parallel, show, note, options)
+            runs = run_planned(planned, out, parallel, show, note, options, certifying)
     except Interrupted:
         print_note(
             "interrupted; every finished generation of every run is saved. The same command again, with "
@@ -167,6 +179,20 @@ def seeds_of(text: str) -> list[int]:
             )
         seeds += range(first, last)
     return seeds
+
+
+def steps_of(text: str) -> list[float]:
+    """Numbers of environment steps from text such as 1e7,1e8."""
+    steps = []
+    for part in filter(None, text.split(",")):
+        try:
+            steps.append(float(part))
+        except ValueError:
+            steps.append(0.0)
+        if not 1 <= steps[-1] < math.inf:
+            what = f"--certify-at {text}: {part} is no number of environment steps; write numbers such as 1e7,1e8"
+            raise ConfigError(what, field="certify_at", value=text)
+    return steps
 
 
 def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from es_service.errors import ConfigError
 from es_service.report import statistics
 from es_service.report.bootstrap import LEVEL
-from es_service.report.compare import LABELS, Group
+from es_service.report.compare import Group, runs_of
 from es_service.report.data import RunData
 from es_service.report.facts import number
 from es_service.report.markup import Markup, table, tag
+from es_service.report.measures import Measure, measures
 from es_service.report.page import section
 from es_service.report.statistics import Difference
-from es_service.runs.certified import measure_of
 
 FORMATS = (".json", ".csv", ".tex")
 """Kinds of files of statistics."""
@@ -86,11 +86,11 @@ def compared(groups: Sequence[Group], threshold: float | None = None, *, paired:
     if paired:
         _require_pairs(groups)
     found = []
-    for name, (title, lower_is_better, value) in _measures(groups, threshold).items():
+    for name, (measure, value) in _measures(groups, threshold).items():
         values_R = _values(groups, value)
         if any(np.isnan(of_group).any() for of_group in values_R):
             continue
-        sign = -1.0 if lower_is_better else 1.0
+        sign = -1.0 if measure.less_is_better else 1.0
         averages = tuple(_average(group, of_group) for group, of_group in zip(groups, values_R, strict=True))
         places = list(combinations(range(len(groups)), 2))
         differences = [
@@ -101,7 +101,7 @@ def compared(groups: Sequence[Group], threshold: float | None = None, *, paired:
             Pair(groups[i].name, groups[j].name, difference._replace(shift=sign * difference.shift + 0.0), p)
             for (i, j), difference, p in zip(places, differences, corrected, strict=True)
         )
-        found.append(Compared(name, title, lower_is_better, averages, pairs))
+        found.append(Compared(name, measure.label, measure.less_is_better, averages, pairs))
     return found
 
 
@@ -110,12 +110,12 @@ def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[NDArray
 
     Raises ConfigError if there is no such measure, or if a run lacks it.
     """
-    measures = _measures(groups, None)
-    title, lower_is_better, value = measures.get(name, ("", False, lambda _: np.nan))
+    known = _measures(groups, None)
+    measure, value = known.get(name, (Measure("", "", ""), lambda _: np.nan))
     found = _values(groups, value)
     if any(np.isnan(of_group).any() for of_group in found):
-        raise ConfigError(f"{name} is no measure that all runs have", value=name, allowed=", ".join(measures))
-    return title, -1.0 if lower_is_better else 1.0, found
+        raise ConfigError(f"{name} is no measure that all runs have", value=name, allowed=", ".join(known))
+    return measure.label, -1.0 if measure.less_is_better else 1.0, found
 
 
 def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[NDArray[np.float64]]:
@@ -125,30 +125,17 @@ def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[
 
 def _measures(
     groups: Sequence[Group], threshold: float | None
-) -> dict[str, tuple[str, bool, Callable[[RunData], float]]]:
-    """Name -> (title, whether less is better, the number of a run; NaN if it has none)."""
-    measure = measure_of(groups[0].runs[0].constants["task.fitness"])
-
-    def certified(column: str, share: bool = False) -> Callable[[RunData], float]:
-        def value(run: RunData) -> float:
-            row = {} if run.certified is None else run.certified.row()
-            found = row.get(column)
-            return np.nan if found is None else float(found) / (row["episodes"] if share else 1)
-
-        return value
+) -> dict[str, tuple[Measure, Callable[[RunData], float]]]:
+    """Name -> (what is said of a measure, its number of a run; NaN if there is none)."""
 
     def cost(run: RunData) -> float:
-        assert threshold is not None
         reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
         return float(run.history["env_steps"][reached[0]]) if reached.size else np.inf
 
-    found: dict[str, tuple[str, bool, Callable[[RunData], float]]] = {
-        "certified": (f"certified {measure.replace('_', ' ')}", False, certified(f"{measure}_mean")),
-        "certified_success": ("certified successes, as a share", False, certified("successes", share=True)),
-        **{column: (title, column == "goal_distance", _last(column)) for column, title in LABELS.items()},
-    }
+    found = {name: (measure, _last(name)) for name, measure in measures(runs_of(groups)).items()}
     if threshold is not None:
-        found[COST] = (f"environment steps until a best fitness of {number(threshold)}", True, cost)
+        label = f"environment steps until a best fitness of {number(threshold)}"
+        found[COST] = (Measure(label, label, "", less_is_better=True), cost)
     return found
 
 

@@ -17,34 +17,13 @@ from es_service.config.text import did_you_mean, in_line, nearest
 from es_service.errors import ConfigError
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
+from es_service.report.measures import CERTIFIED, GAP, measures
 from es_service.report.series import Chart, Line
 
 POINTS = 200
 """Equally spaced points of a curve; the ends of each group are points, too."""
 AXES = ("env_steps", "wall_clock_s")
 """History columns that groups are compared against."""
-COLUMNS = {
-    "best_fitness": ("Best fitness so far", "Highest mean fitness of an evaluated centre or policy.", False),
-    "goal_distance": (
-        "Distance to the goal",
-        "Mean over the evaluation episodes of the newest centre or policy.",
-        False,
-    ),
-    "coverage": ("Coverage of the behaviour map", "Filled cells as a share of all cells.", True),
-    "qd_score": (
-        "QD-score",
-        "Sum over all elites of fitness less map.qd_offset; an elite below that offset lowers it.",
-        False,
-    ),
-}
-"""History column -> title, explanation, whether it is a fraction."""
-LABELS = {
-    "best_fitness": "best fitness",
-    "goal_distance": "distance to the goal",
-    "coverage": "coverage",
-    "qd_score": "QD-score",
-}
-"""History column -> its name on an axis or in a table."""
 OWN_TO_A_RUN = ("seed", "compute.", RESOURCES)
 """Keys, or beginnings of keys, by which runs are not grouped unless a user says so."""
 
@@ -85,13 +64,14 @@ class Summary(NamedTuple):
     intervals: Mapping[str, tuple[float, float]]
     """History column -> interval of the median of these values; empty if there is none, see `Group.interval`."""
     solved: int
-    """Number of runs whose best fitness reached the threshold."""
+    """Number of runs whose value, of `value_column`, reaches the threshold."""
     steps: Quartiles
-    """Environment steps until then, of the runs that reached it; NaN if none did."""
+    """Environment steps until the best fitness reached it, of the runs in which it did; NaN if it never did."""
 
 
 def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
-    """Groups in the order of their first runs, each named by the values of the keys.
+    """Groups by the median of their certified values, the highest first, or else in the order of their first runs;
+    each is named by the values of the keys.
 
     Args:
         keys: dotted config keys; none: the keys in which the runs differ, but for the seed and what follows from
@@ -118,7 +98,20 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
         values = [in_line(run.constants.get(key)) for key in chosen]
         name = values[0] if chosen == ["search.algorithm"] else ", ".join(map("{} {}".format, chosen, values))
         groups.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
-    return [Group(name, tuple(members)) for name, members in groups.items()]
+    found = [Group(name, tuple(members)) for name, members in groups.items()]
+    if value_column(runs) == CERTIFIED:
+        found.sort(key=lambda group: -np.median([run.last(CERTIFIED) for run in group.runs]))
+    return found
+
+
+def value_column(runs: Sequence[RunData]) -> str:
+    """Column of the value by which runs are judged: certified if all are, else the best fitness."""
+    return CERTIFIED if CERTIFIED in measures(runs) else "best_fitness"
+
+
+def runs_of(groups: Sequence[Group]) -> list[RunData]:
+    """The runs of all groups."""
+    return [run for group in groups for run in group.runs]
 
 
 def swept_keys(runs: Sequence[RunData]) -> list[str]:
@@ -157,18 +150,15 @@ def _explaining(constants: Sequence[Mapping[str, Any]], differing: Sequence[str]
 
 
 def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.float64]]:
-    """A chart for each column that all runs have, and the places of its points on an axis of AXES, [K].
+    """A chart for each measure of all runs, and the places of its points on an axis of AXES, [K].
 
     A curve ends where the first run of its group ends, so that every point is over all of its runs. It is empty if that
     is before another run begins; so every axis has the same charts.
     """
     x_K = places(groups, axis)
     chart_list = []
-    for column, (title, note, percent) in COLUMNS.items():
-        runs = [run for group in groups for run in group.runs]
-        if not all(column in run.history for run in runs) or not any(
-            np.isfinite(run.history[column]).any() for run in runs
-        ):
+    for column, measure in measures(runs_of(groups)).items():
+        if column == GAP:
             continue
         lines = []
         for group in groups:
@@ -176,7 +166,7 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             interval = group.interval(y_R_K)
             range_K = None if interval is None else (interval[0], interval[1])
             lines.append(Line(group.name, np.median(y_R_K, axis=0), range_K))
-        chart_list.append(Chart(title, note, tuple(lines), None, percent))
+        chart_list.append(Chart(measure.title, measure.note, tuple(lines), None, measure.percent))
     return chart_list, x_K
 
 
@@ -216,12 +206,9 @@ def common_threshold(runs: Sequence[RunData]) -> float | None:
 def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]:
     """The final values of each group; `threshold`: fitness from which a run counts as solved, None: no run does."""
     summary_list = []
+    value, columns = value_column(runs_of(groups)), (*measures(runs_of(groups)), *AXES)
     for group in groups:
-        last = {
-            column: np.array([[run.last(column)] for run in group.runs], float)
-            for column in (*COLUMNS, *AXES)
-            if all(column in run.history for run in group.runs)
-        }
+        last = {column: np.array([[run.last(column)] for run in group.runs], float) for column in columns}
         intervals = {column: group.interval(y_R_1) for column, y_R_1 in last.items()}
         steps = []
         for run in group.runs:
@@ -234,7 +221,7 @@ def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]
                 group,
                 {column: _quartiles(y_R_1[:, 0].tolist()) for column, y_R_1 in last.items()},
                 {column: (float(x[0, 0]), float(x[1, 0])) for column, x in intervals.items() if x is not None},
-                len(steps),
+                0 if threshold is None else int(np.sum(last[value] >= threshold)),
                 _quartiles(steps),
             )
         )
@@ -250,6 +237,7 @@ def _quartiles(values: Sequence[float]) -> Quartiles:
 
 
 def median_run(group: Group) -> RunData:
-    """The run of a group whose final best fitness is the median (of an even number, the lower of the two)."""
-    ordered = sorted(group.runs, key=lambda run: run.last("best_fitness"))
+    """The run of a group whose final value is the median (of an even number, the lower of the two)."""
+    value = value_column(group.runs)
+    ordered = sorted(group.runs, key=lambda run: run.last(value))
     return ordered[(len(ordered) - 1) // 2]

@@ -16,14 +16,15 @@ from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
 from es_service.report.facts import number
 from es_service.report.markup import Markup, joined, table, tag
+from es_service.report.measures import CERTIFIED, measure_named, measures
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
 from es_service.runs.run_status import state
 
-UNITS = {"coverage": (100.0, " %"), "env_steps": (1e-6, "")}
-"""History column -> factor and unit in which it is shown."""
-HEADS = {**compare.LABELS, "env_steps": "million steps", "wall_clock_s": "seconds"}
-"""History column of the final table -> its heading."""
+COSTS = {"env_steps": "million steps", "wall_clock_s": "seconds"}
+"""History column of a cost -> its heading in the table of final values."""
+VALUES = {CERTIFIED: "certified value", "best_fitness": "best fitness"}
+"""What `compare.value_column` returns -> its name in a sentence."""
 
 
 def comparison_page(
@@ -87,22 +88,27 @@ def comparison_sections(
 
 def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
     summaries = compare.summaries(groups, threshold)
-    best = max(summaries, key=lambda summary: summary.values["best_fitness"].median)
-    value = number(best.values["best_fitness"].median)
+    column = compare.value_column(compare.runs_of(groups))
+    what = VALUES[column]
+    best = max(summaries, key=lambda summary: summary.values[column].median)
+    value = number(best.values[column].median)
     runs = counted(len(best.group.runs), "run")
-    known = _interval(best, "best_fitness")
+    known = _interval(best, column)
     interval = f", {known}" if known else ""
     if len(groups) == 1:
-        sentence = f"{runs} of {best.group.name} end with a best fitness of {value} (median{interval})"
+        sentence = f"{runs} of {best.group.name} end with a {what} of {value} (median{interval})"
     else:
         sentence = (
-            f"Of {len(groups)} groups, {best.group.name} ends with the highest median of best fitness: {value} "
+            f"Of {len(groups)} groups, {best.group.name} ends with the highest median of the {what}: {value} "
             f"({runs}{interval})"
         )
+    if column == CERTIFIED:
+        sentence += f"; the median of its selected best fitness is {number(best.values['best_fitness'].median)}"
     if threshold is not None:
         solved = sum(summary.solved for summary in summaries)
         total = sum(len(summary.group.runs) for summary in summaries)
-        sentence += f"; {solved} of {counted(total, 'run')} reach {number(threshold)}"
+        reach = "have a certified value of at least" if column == CERTIFIED else "reach"
+        sentence += f"; {solved} of {counted(total, 'run')} {reach} {number(threshold)}"
     return f"{sentence}."
 
 
@@ -116,19 +122,22 @@ def _problems(runs: Sequence[RunData]) -> list[Markup]:
 
 def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
     summaries = compare.summaries(groups, threshold)
-    columns = [column for column in HEADS if all(column in summary.values for summary in summaries)]
+    heads_of = {name: measure.label for name, measure in measures(compare.runs_of(groups)).items()} | COSTS
     solved = () if threshold is None else (f"reach {number(threshold)}", "million steps until then")
     rows = []
     for summary in summaries:
         runs = len(summary.group.runs)
-        cells = [_shown(summary.values[column], column, _interval(summary, column)) for column in columns]
+        cells = [_shown(summary.values[column], column, _interval(summary, column)) for column in heads_of]
         reached = (
-            (f"{summary.solved} of {runs}", _shown(summary.steps, "env_steps") if summary.solved else "none")
+            (
+                f"{summary.solved} of {runs}",
+                "none" if np.isnan(summary.steps.median) else _shown(summary.steps, "env_steps"),
+            )
             if solved
             else ()
         )
         rows.append((summary.group.name, _seeds_of(summary.group), *reached, *cells))
-    heads = ("group", "seeds", *solved, *(HEADS[column] for column in columns))
+    heads = ("group", "seeds", *solved, *heads_of.values())
     return Markup(table(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
 
 
@@ -167,13 +176,20 @@ def _interval(summary: Summary, column: str) -> str:
     """The interval of a median in words; empty if it has none, or no extent."""
     if column not in summary.intervals:
         return ""
-    scale, _ = UNITS.get(column, (1.0, ""))
+    scale, _ = _unit(column)
     low, high = (number(scale * value) for value in summary.intervals[column])
     return "" if low == high else f"interval {low} to {high}"
 
 
+def _unit(column: str) -> tuple[float, str]:
+    """Factor and unit in which a column is shown."""
+    if column == "env_steps":
+        return 1e-6, ""
+    return (100.0, " %") if measure_named(column).percent else (1.0, "")
+
+
 def _shown(values: Quartiles, column: str, interval: str = "") -> Markup:
-    scale, unit = UNITS.get(column, (1.0, ""))
+    scale, unit = _unit(column)
     median, low, high = (number(scale * value) for value in values)
     ranges = [interval, "" if low == high else f"quartiles {low} to {high}"]
     return tag("div", f"{median}{unit}", *(_note(text) for text in ranges if text))
@@ -192,6 +208,7 @@ def _maps(groups: Sequence[Group]) -> list[Markup]:
     if not shown:
         return []
     colours = value_range(np.concatenate([run.map.fitness_N for _, run in shown if run.map is not None]))
+    value = VALUES[compare.value_column(compare.runs_of(groups))]
     even = any(len(group.runs) % 2 == 0 for group, _ in shown)
     lower = " (of an even number of runs, the lower of the two in the middle)" if even else ""
     figures = []
@@ -204,7 +221,7 @@ def _maps(groups: Sequence[Group]) -> list[Markup]:
             "Behaviour maps",
             tag(
                 "p",
-                f"Of the run of each group whose best fitness is the median{lower}; all have the same colours.",
+                f"Of the run of each group whose {value} is the median{lower}; all have the same colours.",
                 class_="note",
             ),
             tag("div", *figures, class_="side"),
@@ -222,9 +239,19 @@ def _runs(groups: Sequence[Group]) -> Markup:
             f"{run.constants['seed']}",
             f"{run.last('generation'):,.0f}",
             number(run.last("best_fitness")),
+            _certified(run),
             state(run.status),
         )
         for group in groups
         for run in group.runs
     ]
-    return table(rows, ("run", "group", "seed", "generations", "best fitness", "state"), "listed")
+    return table(rows, ("run", "group", "seed", "generations", "best fitness", "certified", "state"), "listed")
+
+
+def _certified(run: RunData) -> str:
+    """The newest certified value of a run, and where it was certified unless that was at its end."""
+    if not np.isfinite(run.last(CERTIFIED)):
+        return "-"
+    steps = None if run.certified is None else run.certified.env_steps
+    early = f", after {number(steps)} steps" if steps is not None and steps < run.last("env_steps") else ""
+    return f"{number(run.last(CERTIFIED))}{early}"

@@ -22,8 +22,9 @@ from es_service.loop.history import evaluated_nouns
 from es_service.protocol.content import as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
+from es_service.report.measures import with_derived
 from es_service.report.series import X_AXES, Columns
-from es_service.runs.certified import Certified, certified_elsewhere, newest_certified
+from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.strangers import sizes_of, sound_meta
 from es_service.runs.view import Run
@@ -43,7 +44,7 @@ class RunData:
     meta: RunMeta
     task: TaskSpec
     history: Columns
-    """Columns of the history, [G]; a damaged row is left out."""
+    """Columns of the history, [G], and those of certifications; a damaged row is left out."""
     centres: Columns
     """Columns of the evaluated centres, [N], in the order of the asks: `generation`, and those of the run."""
     map: BehaviourMap | None
@@ -141,14 +142,14 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     if lacking := [column for column in X_AXES if not np.isfinite(history[column]).all()]:
         raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
-    certified, elsewhere = _certified(folder, problems)
+    certified, elsewhere, over_time = _certified(folder, problems)
     spec, content = task.parameters, {} if best is None else found.contents.get(best["policy"].tobytes(), {})
     point_D = content.get("parameters_D")
     return RunData(
         folder=folder,
         meta=found.meta,
         task=task,
-        history=history,
+        history=with_derived(history, over_time, found.meta.constants["task.fitness"]),
         centres=_floats(found.evaluations),
         map=_map(found, problems),
         paths=_paths(found),
@@ -208,11 +209,13 @@ def _paths(sound: SoundRun) -> dict[int, NDArray[np.float32]]:
     return {cell: trace[TRACE] for cell, trace in traces.items() if trace is not None}
 
 
-def _certified(folder: Path, problems: list[str]) -> tuple[Certified | None, Mapping[str, Certified]]:
-    """The certified policy, and those in other tasks."""
+def _certified(
+    folder: Path, problems: list[str]
+) -> tuple[Certified | None, Mapping[str, Certified], list[dict[str, Any]]]:
+    """The certified policy, those in other tasks, and a row of each certification."""
     try:
-        return newest_certified(folder), certified_elsewhere(folder)
+        return newest_certified(folder), certified_elsewhere(folder), certified_over_time(folder)
     except StoreError as error:
         if error.sentence not in problems:
             problems.append(error.sentence)
-        return None, {}
+        return None, {}, []

@@ -13,6 +13,7 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
+from es_service.report.measures import GAP, measures
 from es_service.report.overview import draw_overview
 from es_service.report.several_maps import over_seeds
 
@@ -50,8 +51,8 @@ def write_figures(
         ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
     """
     drawings: dict[str, Callable[[Any], Any]] = {}
-    for column in compare.COLUMNS:
-        if all(column in run.history for run in runs):
+    for column in measures(runs):
+        if column != GAP:
             drawings[column] = lambda figure, column=column: plots.curves(
                 list(runs), figure.subplots(), column, group_by=keys
             )

@@ -11,6 +11,7 @@ from es_service.errors import counted
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
+from es_service.report.measures import CERTIFIED
 
 PANELS_IN_A_ROW = 6
 PANEL_SIZE = 1.7
@@ -20,7 +21,7 @@ DOT_AREA = 0.8
 """In square points."""
 FEWEST_COLUMNS = 4
 """So many panels wide is the figure at least, or the curves were too narrow."""
-CURVES = ("best_fitness", "coverage")
+CURVES = (CERTIFIED, "best_fitness", "coverage")
 
 
 def draw_overview(

@@ -24,6 +24,7 @@ from es_service.report.data import RunData, read_run
 from es_service.report.detours import detours
 from es_service.report.floor import beside_walls, is_plan
 from es_service.report.markup import tick_text
+from es_service.report.measures import measure_named
 from es_service.report.series import X_AXES, lone
 from es_service.runs.view import Run
 from es_service.search.maps.geometry import Grid, intervals
@@ -185,7 +186,7 @@ def curves(
         _curve(axes, x_K, np.median(y_R_K, axis=0), style | {"label": group.name})
         if (interval_2_K := group.interval(y_R_K)) is not None:
             axes.fill_between(x_K, *interval_2_K, color=style["color"], alpha=0.18, linewidth=0)
-    axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))
+    axes.set(xlabel=X_AXES[against], ylabel=measure_named(column).label)
     if against == "env_steps":
         axes.xaxis.set_major_formatter(importlib.import_module("matplotlib.ticker").EngFormatter(sep=""))
     _frame(axes, legend=len(groups) > 1)

@@ -45,6 +45,7 @@ from es_service.runs.selection import MEASURES, Measure, Parameters, halved, kep
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
+from es_service.store.reader import read_history
 from es_service.store.writer import RunStore
 
 OTHER_PROGRAMS = 2**40
@@ -122,14 +123,26 @@ def certify_run(
             why = "its map is empty" if top else "no candidate is named"
             raise NotInRunError(f"{run.folder}: there is no policy to certify; {why}", run=run.folder)
         certified = _certify(config, different(chosen), store.next_certification, episodes, keep, by, other, on_notice)
-        add_certified(store, certified, on_notice)
-    return certified
+        return add_certified(store, certified, on_notice, generation)
 
 
-def add_certified(store: RunStore, certified: Sequence[Certified], on_notice: Callable[[str], None]) -> None:
-    """Store a certification in its run, once no other program holds the database."""
+def add_certified(
+    store: RunStore,
+    certified: Sequence[Certified],
+    on_notice: Callable[[str], None],
+    generation: int | None = None,
+) -> list[Certified]:
+    """Store a certification in its run, once no other program holds the database; returns it as it is stored.
+
+    Args:
+        generation: that from whose state the candidates were taken; None: the newest.
+    """
+    row = store.last_history() if generation is None else next(iter(read_history(store.folder, generation, 1)), None)
+    env_steps = None if row is None else int(row["env_steps"])
+    certified = [replace(policy, env_steps=env_steps) for policy in certified]
     rows = [stored(policy) for policy in certified]
     when_free(partial(store.add_certification, rows), telling_once(store.folder, on_notice))
+    return certified
 
 
 @contextmanager

@@ -109,6 +109,9 @@ class Certified:
     observation_std_O: FloatArray
     elsewhere: Elsewhere | None = None
     """The same policy in another task; None if it was not asked for."""
+    env_steps: int | None = None
+    """Environment steps of the run at the generation from which the candidates were taken; None if it is not known: in
+    runs of versions before 0.27, and for other policies."""
 
     @property
     def policy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -152,6 +155,7 @@ class Certified:
             "selection_steps": self.selection_steps,
             "decides": self.decides,
             "tries": self.tries,
+            "env_steps": self.env_steps,
             "episodes": self.episodes.count,
             **self.episodes.values(),
             **there,
@@ -179,6 +183,12 @@ def all_certifications(folder: Path) -> list[Certified]:
 def certified_policies(folder: Path) -> list[Certified]:
     """All certified policies of a run, without the decisions; otherwise as `all_certifications`."""
     return [policy for policy in all_certifications(folder) if not policy.decides]
+
+
+def certified_over_time(folder: Path) -> list[dict[str, Any]]:
+    """The row of the policy that each certification of a run has put first, in order. Raises StoreError if one is
+    damaged."""
+    return [policy.row() for policy in certified_policies(folder) if policy.rank == 0]
 
 
 def newest_certified(folder: Path) -> Certified | None:
@@ -331,11 +341,11 @@ def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 def _form(kind: type, names: Sequence[str], **more: Any) -> Any:
     hints = get_type_hints(kind)
-    return create_model(f"_{kind.__name__}", __base__=Form, **{name: (hints[name], ...) for name in names}, **more)
+    return create_model(f"_{kind.__name__}", __base__=Form, **{name: (hints[name], ...) for name in names} | more)
 
 
 _FactsElsewhere = _form(Elsewhere, _FACTS_ELSEWHERE)
-_Facts = _form(Certified, _FACTS, elsewhere=(_FactsElsewhere | None, None))
+_Facts = _form(Certified, _FACTS, elsewhere=(_FactsElsewhere | None, None), env_steps=(int | None, None))
 _EPISODES = {
     **dict.fromkeys(("return_E", "last_reward_E", "goal_distance_E", "descriptor_E_B"), REAL),
     "steps_E": INTEGER,
@@ -365,7 +375,7 @@ def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     if found or not lengths["E"]:
         which = f"row {row.rank} of certification {row.number}"
         raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
-    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts[name] for name in _FACTS}
+    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts.get(name) for name in _FACTS}
     if (known := facts.get(_ELSEWHERE)) is not None:
         known = {name: known[name] for name in _FACTS_ELSEWHERE}
         own[_ELSEWHERE] = Elsewhere(**known, episodes=_episodes(there))

@@ -1,7 +1,8 @@
 """Sweeps: several runs of one config, each in a child process, so that one that fails does not touch the others.
 
-A child is `es-service run CONFIG --or-resume --out FOLDER`. It is bound to this process: if the sweep is killed, so are
-its runs, and the same sweep again resumes each from its last finished generation.
+A child is `es-service run CONFIG --or-resume --out FOLDER`, or `es-service evaluate FOLDER --certify` where a run is to
+be certified. It is bound to this process: if the sweep is killed, so are its runs, and the same sweep again resumes
+each from its last finished generation.
 """
 
 from __future__ import annotations
@@ -18,27 +19,21 @@ from types import MappingProxyType
 from typing import IO, Literal
 
 from es_service.config.given import Overrides, Source
-from es_service.config.model import RunConfig
 from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
-from es_service.loop.budget import limits_of, only_started, spent
+from es_service.loop.budget import limits_of
 from es_service.loop.history import Row
-from es_service.protocol.parent import bound, require_same_process
+from es_service.protocol.parent import require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.system import given_path
-from es_service.runs.certified import target_reached
-from es_service.runs.run_status import recent_durations
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
+from es_service.runs.sweep_commands import Certifying, Command, command_of, end, newest
 from es_service.runs.sweep_cores import shared
 from es_service.runs.sweep_plan import Grid, PlannedRun, plan
-from es_service.store.folder import explained, holds_run
 from es_service.store.lock import acquire_lock
-from es_service.store.reader import read_newest
 
 _LOG = logger(__name__)
-_Command = tuple[str, list[str]]
-"""Name of a run, and the words that start its process."""
 INSIDE = ".sweep"
 """Folder beside those of the runs, with the config that each is given and what it prints."""
 POLL_S = 0.1
@@ -76,6 +71,8 @@ def sweep(
     seeds: Iterable[int] | None = None,
     overrides: Overrides = (),
     parallel: int | None = None,
+    certify: bool = False,
+    certify_at: Iterable[float] = (),
     on_progress: OnProgress = lambda runs: None,
 ) -> list[SweptRun]:
     """Run a config with every combination of some settings and every seed; each run has a folder in `out`.
@@ -91,6 +88,9 @@ def sweep(
         overrides: settings of all runs, as in `load_config`.
         parallel: number of runs at a time, which share the cores of the machine or the cluster unless
             `compute.workers` is a number; None: as many as there are cores, or one if they use GPUs.
+        certify: whether each run is certified at its end, by `certify_run`.
+        certify_at: numbers of environment steps at which runs are certified, too: after the generation that reaches
+            them. Given any, runs are also certified at their ends.
 
     Returns:
         The runs, for example for `write_comparison`: each "finished", "failed", or "stopped" since starting took all of
@@ -102,7 +102,11 @@ def sweep(
             reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
     """
     folder = given_path(out)
-    return run_planned(plan(config, folder, grid, seeds, overrides), folder, parallel, on_progress)
+    points = tuple(certify_at)
+    certifying = Certifying(points) if certify or points else None
+    return run_planned(
+        plan(config, folder, grid, seeds, overrides), folder, parallel, on_progress, certifying=certifying
+    )
 
 
 def run_planned(
@@ -112,20 +116,22 @@ def run_planned(
     on_progress: OnProgress = lambda runs: None,
     on_notice: OnNotice = _LOG.info,
     options: Sequence[str] = (),
+    certifying: Certifying | None = None,
 ) -> list[SweptRun]:
     """Run what `plan` has returned for the folder `out`; otherwise as `sweep`.
 
     Args:
         on_notice: called with a sentence on how the cores are shared.
         options: further options of `es-service run` for each run.
+        certifying: when runs are certified; None: never.
     """
     with _locked(out) as inside, stop_on_signals() as should_stop:
-        runs = {run.name: _at_first(run) for run in planned}
-        configs = {run.name: run.config for run in planned}
+        runs = {run.name: _at_first(run, certifying) for run in planned}
         left = [run for run in planned if runs[run.name].state == "waiting"]
         shares = shared([run.config for run in left], parallel)  # a few that are left have more cores each
         waiting = deque(
-            _given(run, workers, inside, options) for run, workers in zip(left, shares.workers, strict=True)
+            command_of(run, workers, inside, options, certifying)
+            for run, workers in zip(left, shares.workers, strict=True)
         )
         if left:
             todo = f"{len(left)} of {counted(len(runs), 'run')} to do in {out}, {shares.at_once} at a time"
@@ -138,12 +144,15 @@ def run_planned(
                 if (number := should_stop()) is not None:
                     raise Interrupted(number)
                 for name in [name for name, child in running.items() if child.process.poll() is not None]:
-                    runs[name] = _ended(runs[name], running.pop(name), configs[name])
+                    child = running.pop(name)
+                    runs[name] = _ended(runs[name], child)
+                    if runs[name].state == "waiting":
+                        _start(child.command, inside, runs, running)
                 while waiting and len(running) < shares.at_once:
                     _start(waiting.popleft(), inside, runs, running)
                 if time.monotonic() - read_s > ROWS_S:
                     read_s = time.monotonic()
-                    runs |= {name: replace(runs[name], row=_newest(runs[name].folder)) for name in running}
+                    runs |= {name: replace(runs[name], row=newest(runs[name].folder)) for name in running}
                 if (now := list(runs.values())) != shown:
                     on_progress(shown := now)
                 if running:
@@ -151,27 +160,18 @@ def run_planned(
         except ForkedError:
             raise  # the runs go on
         except BaseException:
-            _stop(runs, running, configs)
+            _stop(runs, running)
             with suppress(Exception):
                 on_progress(list(runs.values()))
             raise
     return list(runs.values())
 
 
-def _given(run: PlannedRun, workers: int | Literal["auto"], inside: Path, options: Sequence[str]) -> _Command:
-    """The command of a run. Its config is written now, so that an edited file does not reach runs that start later."""
-    file = inside / f"{run.name}.yaml"
-    try:
-        file.write_text(run.config.given_yaml({"compute.workers": workers}))
-    except OSError as error:
-        raise explained(error, inside, f"writing {file.name}", "start the sweep again") from error
-    return run.name, bound("es_service", "run", str(file), "--or-resume", "--out", str(run.folder), *options)
-
-
 @dataclass(eq=False)
 class _Child:
     """The process of a run."""
 
+    command: Command
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     """What it prints, after what earlier processes of the same run printed."""
@@ -179,9 +179,10 @@ class _Child:
     """Where in the log its own output begins."""
 
 
-def _start(command: _Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Child]) -> None:
-    """Start the process of a run; the run has failed if that is impossible."""
-    name, words = command
+def _start(command: Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Child]) -> None:
+    """Start the next process of a run; the run has failed if that is impossible."""
+    name, words = command.planned.name, command.next_words() or command.run
+    command.before = words
     try:
         with ExitStack() as opened:
             log = opened.enter_context(open(inside / f"{name}.log", "ab+"))
@@ -198,28 +199,30 @@ def _start(command: _Command, inside: Path, runs: dict[str, SweptRun], running: 
     except OSError as error:
         runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")
         return
-    running[name], runs[name] = _Child(process, log, begin), replace(runs[name], state="running")
+    running[name], runs[name] = _Child(command, process, log, begin), replace(runs[name], state="running")
 
 
-def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child], configs: Mapping[str, RunConfig]) -> None:
+def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child]) -> None:
     """Ask all processes to end as Ctrl-C would, and wait for them. A second signal to this process ends it at once, and
     with it all that are bound to it."""
     for child in running.values():
         child.process.terminate()
     for name, child in running.items():
         child.process.wait()
-        ended = _ended(runs[name], child, configs[name])
+        ended = _ended(runs[name], child)
         runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
 
 
-def _ended(run: SweptRun, child: _Child, config: RunConfig) -> SweptRun:
-    """A run after its process has ended."""
-    code, row = child.process.returncode, _newest(run.folder)
+def _ended(run: SweptRun, child: _Child) -> SweptRun:
+    """A run after its process has ended; "waiting" if another one follows."""
+    code, row = child.process.returncode, newest(run.folder)
     with child.log as log:
         log.seek(max(child.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
         lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
     if code == 0:
-        state, reason = _end(run.folder, config, row)
+        state, reason = end(run.folder, child.command.planned.config, row)
+        if child.command.next_words() not in ([], child.command.before):
+            return replace(run, state="waiting", row=row)
         return replace(run, state="finished" if state == "waiting" else state, row=row, reason=reason)
     how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
@@ -228,32 +231,14 @@ def _ended(run: SweptRun, child: _Child, config: RunConfig) -> SweptRun:
     return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {log.name})")
 
 
-def _at_first(planned: PlannedRun) -> SweptRun:
-    """A run that the sweep has not started: finished, if its budget was spent or its target reached before."""
-    row = _newest(planned.folder)
-    state, reason = _end(planned.folder, planned.config, row)
+def _at_first(planned: PlannedRun, certifying: Certifying | None) -> SweptRun:
+    """A run that the sweep has not started: finished, if its budget was spent or its target reached before, and if it
+    is certified where it is to be."""
+    row = newest(planned.folder)
+    state, reason = end(planned.folder, planned.config, row)
+    if state == "finished" and certifying and certifying.next_point(planned, row, ended=True) is not None:
+        state, reason = "waiting", ""
     return SweptRun(planned.name, planned.folder, limits_of(planned.config.budget), state, row, reason)
-
-
-def _end(folder: Path, config: RunConfig, row: Row | None) -> tuple[Literal["waiting", "finished", "stopped"], str]:
-    """Whether a run that no process computes is over, and why; it is "waiting" if it is not, or if it cannot be read,
-    which its own process tells, and "stopped" if starting took all of its time."""
-    if row is None:
-        return "waiting", ""
-    with suppress(StoreError):
-        if reached := target_reached(folder, config.budget.target_certified, config.task.fitness):
-            return "finished", reached
-    limits = limits_of(config.budget)
-    reason = next(iter(spent(limits, row, recent_durations(folder, limits, row)).values()), "")
-    return ("stopped" if only_started(limits, row) else "finished" if reason else "waiting"), reason
-
-
-def _newest(folder: Path) -> Row | None:
-    """Newest history row of a run; None if there is none, or if the run cannot be read, which its own process tells."""
-    try:
-        return read_newest(folder) if holds_run(folder) else None
-    except StoreError:
-        return None
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from es_service.report.bootstrap import median_interval
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
 from es_service.report.figures import empty_figure
+from es_service.report.measures import with_derived
 from es_service.report.write import write_comparison
 from tests.es_service.test_report_compare import words
 from tests.run_examples import write_run
@@ -201,6 +202,46 @@ def test_a_page_says_what_so_few_runs_can_show(runs):
     assert "Runs count as independent" in said
     assert "Wilcoxon" in words(comparison_page(runs, paired=True))
     assert "Between groups" not in words(comparison_page(runs[:4]))
+
+
+def certified(run, *values, fitness="sum"):
+    """The same run with certifications: (environment steps, mean, successes of 256) of each."""
+    rows = [
+        {"env_steps": steps, "return_mean": mean, "successes": successes, "episodes": 256}
+        for steps, mean, successes in values
+    ]
+    return replace(run, history=with_derived(run.history, rows, fitness))
+
+
+def test_a_certified_value_holds_until_the_next_one(runs):
+    steps_G = runs[0].history["env_steps"]
+    history = certified(runs[0], (None, 9.0, None), (steps_G[4], 2.0, 64), (steps_G[2], 1.0, None)).history
+    np.testing.assert_array_equal(history["certified"], [np.nan] * 2 + [1.0] * 2 + [2.0] * (len(steps_G) - 5) + [9.0])
+    np.testing.assert_array_equal(history["certified_success"], [np.nan] * 4 + [0.25] * (len(steps_G) - 4))
+    assert history["selection_gap"][-1] == history["best_fitness"][-1] - 9.0
+    corrected = {**runs[0].history, "corrected_coverage": np.full(len(steps_G), np.nan)}
+    corrected["corrected_coverage"][3] = 0.5
+    assert with_derived(corrected, [], "sum")["corrected_coverage"][[2, 3, -1]].tolist()[1:] == [0.5, 0.5]
+
+
+def test_groups_are_judged_by_certified_values_if_all_have_one(runs):
+    """me_es has the higher certified values, es the higher selected ones."""
+    end = int(runs[0].last("env_steps"))
+    values = [(-90.0 if run.constants["search.algorithm"] == "es" else -80.0) - run.constants["seed"] for run in runs]
+    all_certified = [certified(run, (end, value, None)) for run, value in zip(runs, values, strict=True)]
+    groups = compare.grouped(all_certified)
+    assert [group.name for group in groups] == ["me_es", "es"]
+    assert compare.median_run(groups[0]).last("certified") == -82.0
+    said = words(comparison_page(all_certified, threshold=-81.0))
+    assert "Of 2 groups, me_es ends with the highest median of the certified value: -81.50 (4 runs" in said
+    assert "; the median of its selected best fitness is -71.50; 2 of 8 runs have a certified value of at least" in said
+    assert "best less certified" in said
+    measures = between.compared(groups)
+    assert [measure.name for measure in measures][:2] == ["certified", "best_fitness"]
+    assert measures[0].pairs[0].difference.improvement == 1.0
+    one_left = [*all_certified[:-1], runs[-1]]
+    assert [group.name for group in compare.grouped(one_left)] == ["es", "me_es"]
+    assert "highest median of the best fitness" in words(comparison_page(one_left))
 
 
 def test_files_of_statistics(runs, tmp_path):

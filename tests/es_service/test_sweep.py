@@ -5,6 +5,8 @@ Sweeps themselves are in `tests/system/test_sweep.py`.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,13 +16,14 @@ from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli.main import app
-from es_service.cli.sweep import grid_of, seeds_of
+from es_service.cli.sweep import grid_of, seeds_of, steps_of
 from es_service.cli.tables.sweep import live_table
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
-from es_service.runs import sweep_cores
+from es_service.runs import sweep_commands, sweep_cores
 from es_service.runs.sweep import INSIDE, SweptRun, sweep
+from es_service.runs.sweep_commands import Certifying, command_of
 from es_service.runs.sweep_cores import divide, share
 from es_service.runs.sweep_plan import left_out_notes, plan
 from tests.es_service.config_examples import MINIMAL
@@ -131,6 +134,13 @@ def test_other_seeds_are_refused(text):
     assert error.value.suggestion == {"5:0": "0:6", "5:5": "5:6"}.get(text)
 
 
+def test_points_of_cost_are_environment_steps():
+    assert steps_of("1e7, 100000000") == [1e7, 1e8]
+    for text in ("x", "0", "nan", "inf", "1e7,-1"):
+        with pytest.raises(ConfigError, match="is no number of environment steps"):
+            steps_of(text)
+
+
 def test_values_of_the_grid_are_those_of_set(tmp_path):
     words = ["policy.hidden=[64, 64],[16]", "task.options.start=corner,off", "search.sigma = 1e-2, 0.1"]
     grid = {"policy.hidden": [[64, 64], [16]], "task.options.start": ["corner", "off"], "search.sigma": [0.01, 0.1]}
@@ -166,6 +176,48 @@ def test_options_that_contradict_each_other_are_refused(tmp_path):
         assert isinstance(result.exception, ConfigError)
         assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_is_certified_at_points_of_cost_and_at_its_end(tmp_path, monkeypatch):
+    """The points are given as environment steps; a generation of these runs has 1,000, and the budget is 20,000."""
+    planned = plan(MINIMAL, tmp_path, {}, [0], ["budget.env_steps=20000", "budget.generations=1000"])[0]
+    steps, done = [0], []
+    monkeypatch.setattr(sweep_commands, "certified_over_time", lambda _: [{"env_steps": value} for value in done])
+    monkeypatch.setattr(sweep_commands, "holds_run", lambda _: steps[0] > 0)
+    monkeypatch.setattr(sweep_commands, "recent_durations", lambda *_: ())
+    monkeypatch.setattr(
+        sweep_commands, "read_newest", lambda _: {"generation": 0, "env_steps": steps[0], "best_fitness": 0.0}
+    )
+    (tmp_path / INSIDE).mkdir()
+
+    def words(*at):
+        command = command_of(planned, 2, tmp_path / INSIDE, ["--log=wandb"], Certifying(at))
+        return command.next_words()
+
+    run, certify = (
+        [planned.folder.name, "--log=wandb"],
+        ["evaluate", str(planned.folder), "--certify", "--workers", "2"],
+    )
+    for now, known, expected in (
+        (0, [], "budget.env_steps=7001"),
+        (7000, [], "budget.env_steps=7001"),
+        (8000, [], "certify"),
+        (8000, [8000], "budget.env_steps=12000"),
+        (12000, [8000, 12000], ""),
+        (20000, [8000, 12000], "certify"),
+        (20000, [8000, 12000, 20000], None),
+        (20000, [20000], None),
+    ):
+        steps[0], done[:] = now, known
+        found = words(12000, 7000.5, 30000)
+        if expected is None:
+            assert found == []
+        elif expected == "certify":
+            assert found[-5:] == certify
+        else:
+            assert found[-1] == (expected or run[-1])
+            assert "run" in found
+    assert Certifying().next_point(planned, None, ended=False) == math.inf
 
 
 def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):
