@@ -12,6 +12,7 @@ import typer
 
 from es_service.cli.commands import assignments, error_message
 from es_service.cli.console import console, errors, print_line
+from es_service.config.given import Source
 from es_service.config.model import RunConfig, implied_by
 from es_service.config.tasks import ROLLOUTS, task_of
 from es_service.config.text import show
@@ -122,7 +123,7 @@ def print_error(error: ServiceError | str) -> None:
     print_note(f"error: {message}", style="red")
 
 
-def print_config_notes(source: Path, configs: Sequence[RunConfig]) -> None:
+def print_config_notes(source: Source, configs: Sequence[RunConfig]) -> None:
     """Print what a user should know before a run about configs made from `source` by overrides: ignored keys, values
     that stay although another method has other defaults, and settings that are probably not intended. What several
     configs have in common is printed once."""

@@ -15,7 +15,6 @@ from es_service import api
 from es_service.cli.console import console, errors
 from es_service.cli.options import (
     AddressOption,
-    ConfigArgument,
     EngineOption,
     LogLevelOption,
     LogOption,
@@ -28,11 +27,11 @@ from es_service.cli.options import (
 from es_service.cli.tables.sweep import show_sweep
 from es_service.config.given import parse_overrides
 from es_service.config.text import split_values
-from es_service.errors import ConfigError, Interrupted, Problem
+from es_service.errors import ConfigError, Interrupted, Problem, counted
 from es_service.protocol.system import given_path
 from es_service.runs.sweep import SweptRun, run_planned
 from es_service.runs.sweep_commands import Certifying
-from es_service.runs.sweep_plan import left_out_notes, plan
+from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
 from es_service.runs.trackers import check_trackers
 
 SeedsOption = Annotated[
@@ -50,11 +49,23 @@ ParallelOption = Annotated[
 
 
 def sweep(
-    config: ConfigArgument,
+    configs: Annotated[
+        list[Path],
+        typer.Argument(
+            parser=given_path,
+            metavar="CONFIG...",
+            help="YAML files, or names of shipped configs; each of several is a group.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[
         Path,
         typer.Option("--out", parser=given_path, help="Folder, in which each run gets a folder.", show_default=False),
     ],
+    label: Annotated[
+        list[str] | None,
+        typer.Option("--label", help="Name of the group of each config, in their order; default: that of the file."),
+    ] = None,
     grid: GridOption = None,
     seeds: SeedsOption = None,
     set_: SetOption = None,
@@ -74,13 +85,13 @@ def sweep(
     log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
-    """Run a config with several settings and seeds, and compare the runs. The same command again continues it."""
-    if not grid and seeds is None:
-        raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both")
+    """Run configs with several settings and seeds, and compare the runs. The same command again continues it."""
+    if not grid and seeds is None and len(configs) < 2:
+        raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both, or several configs")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     certifying = Certifying(steps_of(certify_at or "")) if certify or certify_at else None
     options = _options_of_each(log, log_level)
-    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying)
+    run_sweep(labelled(configs, label or ()), out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying)
 
 
 def run_seeds(
@@ -96,7 +107,7 @@ def run_seeds(
     if seed is not None:
         raise ConfigError("--seed and --seeds cannot be combined; give one of them")
     folder = out if out is not None else api.default_folder(api.load_config(config, wanted), "seeds")
-    run_sweep(config, folder, wanted, {}, seeds, None, _options_of_each(log, log_level))
+    run_sweep(labelled([config], ()), folder, wanted, {}, seeds, None, _options_of_each(log, log_level))
 
 
 def _options_of_each(trackers: list[str] | None, log_level: str | None) -> list[str]:
@@ -106,8 +117,20 @@ def _options_of_each(trackers: list[str] | None, log_level: str | None) -> list[
     return [*(f"--log={tracker}" for tracker in trackers or ()), *level]
 
 
+def labelled(configs: Sequence[Path], labels: Sequence[str]) -> list[Labelled]:
+    """Configs with the labels of their groups; one alone needs none."""
+    if labels and len(labels) != len(configs):
+        raise ConfigError(
+            f"--label: there are {len(labels)} for {counted(len(configs), 'config')}; give one for each",
+            field="label",
+            value=list(labels),
+        )
+    default = [""] if len(configs) == 1 else [config.stem for config in configs]
+    return list(map(Labelled, labels or default, configs))
+
+
 def run_sweep(
-    config: Path,
+    configs: Sequence[Labelled],
     out: Path,
     wanted: Sequence[str],
     grid: dict[str, list[Any]],
@@ -117,8 +140,9 @@ def run_sweep(
     certifying: Certifying | None = None,
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
-    planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
-    print_config_notes(config, [run.config for run in planned])
+    planned = plan(configs, out, grid, None if seeds is None else seeds_of(seeds), wanted)
+    for config in configs:
+        print_config_notes(config.source, [run.config for run in planned if run.source == config.source])
     for note in left_out_notes(planned):
         print_note(f"note: {note}")
     try:
@@ -130,8 +154,7 @@ def run_sweep(
             f"--out {shlex.quote(str(out))}, continues"
         )
         raise
-    constants = {key for run in planned for key in run.config.constants()}
-    _compare(runs, out, [key for key, values in grid.items() if len(values) > 1 and key in constants])
+    _compare(runs, out)
     for run in runs:
         if run.state == "stopped":
             print_note(f"{run.name} is not finished: {run.reason}. Raise budget.wall_clock_s")
@@ -143,7 +166,7 @@ def run_sweep(
         raise typer.Exit(1)
 
 
-def _compare(runs: Sequence[SweptRun], out: Path, keys: Sequence[str]) -> None:
+def _compare(runs: Sequence[SweptRun], out: Path) -> None:
     """Write the page that compares the runs with a finished generation; a note if they cannot be compared."""
     from es_service.report.write import REPORT, write_comparison
 
@@ -151,7 +174,7 @@ def _compare(runs: Sequence[SweptRun], out: Path, keys: Sequence[str]) -> None:
     if not folders:
         return
     try:
-        for file in write_comparison(folders, out / REPORT, keys):
+        for file in write_comparison(folders, out / REPORT):
             print(file)
     except ConfigError as error:
         print_note(f"note: there is no comparison, since {error.sentence}")

@@ -136,7 +136,7 @@ class NoveltyConfig(Section):
     newest: Count | None = Field(
         None,
         description="Number of the newest entries of the novelty archive with which a descriptor is compared; null: "
-        "all. The archive keeps the others, too.",
+        "no limit. The archive keeps the others, too.",
     )
 
 

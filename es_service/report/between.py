@@ -129,7 +129,7 @@ def _measures(
     """Name -> (what is said of a measure, its number of a run; NaN if there is none)."""
 
     def cost(run: RunData) -> float:
-        reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
+        reached = np.flatnonzero(run.history["best_fitness"] >= (np.inf if threshold is None else threshold))
         return float(run.history["env_steps"][reached[0]]) if reached.size else np.inf
 
     found = {name: (measure, _last(name)) for name, measure in measures(runs_of(groups)).items()}

@@ -19,6 +19,8 @@ from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
 from es_service.report.measures import CERTIFIED, GAP, measures
 from es_service.report.series import Chart, Line
+from es_service.runs.setting_words import settings_words
+from es_service.runs.sweep_plan import ENVIRONMENT
 
 POINTS = 200
 """Equally spaced points of a curve; the ends of each group are points, too."""
@@ -74,8 +76,9 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
     each is named by the values of the keys.
 
     Args:
-        keys: dotted config keys; none: the keys in which the runs differ, but for the seed and what follows from
-            others, or the algorithm alone if it explains all differences.
+        keys: dotted config keys; none: the groups of their sweep, if the runs are of one sweep that has named them; or
+            else the keys in which the runs differ, but for the seed and what follows from others, or the algorithm
+            alone if it explains all differences.
 
     Raises:
         ConfigError: a key is unknown, or the runs are of different tasks.
@@ -91,12 +94,14 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
                 suggestion=nearest(key, known),
             )
     differing = [key for key in known if len({in_line(settings.get(key)) for settings in constants}) > 1]
-    _refuse_other_tasks(runs, [key for key in differing if key not in keys or key == "task.environment"])
+    are_named = not keys and all(run.group for run in runs) and len({run.folder.parent for run in runs}) == 1
+    allowed = {*keys, *(differing if are_named else ())} - {ENVIRONMENT}
+    _refuse_other_tasks(runs, [key for key in differing if key not in allowed])
     chosen = list(keys) or _explaining(constants, differing)
     groups: dict[str, list[RunData]] = {}
     for run in runs:
-        values = [in_line(run.constants.get(key)) for key in chosen]
-        name = values[0] if chosen == ["search.algorithm"] else ", ".join(map("{} {}".format, chosen, values))
+        settings = {key: run.constants[key] for key in chosen if key in run.constants}
+        name = run.group if are_named else settings_words(settings)
         groups.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
     found = [Group(name, tuple(members)) for name, members in groups.items()]
     if value_column(runs) == CERTIFIED:
@@ -129,7 +134,7 @@ def _refuse_other_tasks(runs: Sequence[RunData], differing: Sequence[str]) -> No
             values = {in_line(run.constants.get(key)): run for run in reversed(runs)}
             shown = "; ".join(f"{run.folder} has {value}" for value, run in reversed(values.items()))
             ways = "compare runs of one task"
-            if key != "task.environment":
+            if key != ENVIRONMENT:
                 ways += f", or group by {key}"
             raise ConfigError(
                 f"these runs cannot be compared, because {key} differs: {shown}; {ways}", field=key, value=list(values)

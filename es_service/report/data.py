@@ -25,6 +25,7 @@ from es_service.protocol.messages import TaskSpec
 from es_service.report.measures import with_derived
 from es_service.report.series import X_AXES, Columns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
+from es_service.runs.folders import group_of
 from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.strangers import sizes_of, sound_meta
 from es_service.runs.view import Run
@@ -64,6 +65,8 @@ class RunData:
     """The digest; empty if it cannot be computed, or while a driver is writing."""
     problems: tuple[str, ...]
     """What is damaged, one sentence each."""
+    group: str = ""
+    """Name of the group to which its sweep counts it; empty if there is none."""
     best_parameters: Mapping[str, float] = field(default_factory=dict)
     """Parameters of the best centre by name, if the task is a function of them."""
 
@@ -160,6 +163,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         platforms=found.platforms,
         digest="",
         problems=tuple(problems),
+        group=group_of(folder.absolute()),
         best_parameters={} if spec is None or point_D is None else spec.named(point_D),
     )
 

@@ -341,7 +341,8 @@ def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 def _form(kind: type, names: Sequence[str], **more: Any) -> Any:
     hints = get_type_hints(kind)
-    return create_model(f"_{kind.__name__}", __base__=Form, **{name: (hints[name], ...) for name in names} | more)
+    fields_ = {name: (hints[name], ...) for name in names if name not in more}
+    return create_model(f"_{kind.__name__}", __base__=Form, **fields_, **more)
 
 
 _FactsElsewhere = _form(Elsewhere, _FACTS_ELSEWHERE)
@@ -375,7 +376,7 @@ def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     if found or not lengths["E"]:
         which = f"row {row.rank} of certification {row.number}"
         raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
-    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts.get(name) for name in _FACTS}
+    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts[name] for name in _FACTS if name in facts}
     if (known := facts.get(_ELSEWHERE)) is not None:
         known = {name: known[name] for name in _FACTS_ELSEWHERE}
         own[_ELSEWHERE] = Elsewhere(**known, episodes=_episodes(there))

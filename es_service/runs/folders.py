@@ -2,11 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
-from es_service.runs.sweep import INSIDE
 from es_service.store.folder import holds_run, runs_inside
+
+INSIDE = ".sweep"
+"""Folder beside the runs of a sweep, with the config that each is given, what it prints, and its group."""
+GROUPS = "groups.json"
+"""File there: name of a run -> name of its group."""
+_MOST_CHARACTERS = 200
+
+
+def group_of(run: Path) -> str:
+    """Name of the group to which its sweep counts a run; empty if there is none."""
+    return _groups(run.parent / INSIDE).get(run.name, "")
+
+
+def write_groups(inside: Path, groups: Mapping[str, str]) -> None:
+    """Add the groups of runs to those that a sweep has written before. Raises OSError."""
+    if known := {**_groups(inside), **{name: group for name, group in groups.items() if group}}:
+        (inside / GROUPS).write_text(json.dumps(known, indent=1))
+
+
+def _groups(inside: Path) -> dict[str, str]:
+    try:
+        found = json.loads((inside / GROUPS).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    pairs = found.items() if isinstance(found, dict) else ()
+    return {name: group[:_MOST_CHARACTERS] for name, group in pairs if isinstance(group, str)}
 
 
 def runs_of(folder: Path) -> list[Path]:

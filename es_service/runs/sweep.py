@@ -26,16 +26,16 @@ from es_service.loop.history import Row
 from es_service.protocol.parent import require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.system import given_path
+from es_service.runs.folders import INSIDE, write_groups
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.sweep_commands import Certifying, Command, command_of, end, newest
 from es_service.runs.sweep_cores import shared
-from es_service.runs.sweep_plan import Grid, PlannedRun, plan
+from es_service.runs.sweep_plan import Grid, Labelled, PlannedRun, plan
+from es_service.store.folder import explained
 from es_service.store.lock import acquire_lock
 
 _LOG = logger(__name__)
-INSIDE = ".sweep"
-"""Folder beside those of the runs, with the config that each is given and what it prints."""
 POLL_S = 0.1
 ROWS_S = 1.0
 """Seconds between two readings of the newest generation of each run."""
@@ -64,7 +64,7 @@ OnProgress = Callable[[Sequence[SweptRun]], None]
 
 
 def sweep(
-    config: Source,
+    config: Source | Sequence[Labelled],
     out: str | os.PathLike[str],
     *,
     grid: Grid = MappingProxyType({}),
@@ -81,7 +81,8 @@ def sweep(
     resumed. A run that fails does not stop the others.
 
     Args:
-        config: a YAML file, the name of a shipped config, or a mapping with the content of one.
+        config: a YAML file, the name of a shipped config, or a mapping with the content of one; or a list of
+            `Labelled(label, config)`, each of which is a group with its own settings.
         out: folder of the sweep, which is created with its parents.
         grid: key of the config -> its values, such as {"search.sigma": [0.05, 0.1]}.
         seeds: such as range(5); None: the seed of the config.
@@ -126,6 +127,10 @@ def run_planned(
         certifying: when runs are certified; None: never.
     """
     with _locked(out) as inside, stop_on_signals() as should_stop:
+        try:
+            write_groups(inside, {run.name: run.group for run in planned})
+        except OSError as error:
+            raise explained(error, inside, "writing the groups", "start the sweep again") from error
         runs = {run.name: _at_first(run, certifying) for run in planned}
         left = [run for run in planned if runs[run.name].state == "waiting"]
         shares = shared([run.config for run in left], parallel)  # a few that are left have more cores each

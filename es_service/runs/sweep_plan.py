@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.loading import read
@@ -16,14 +17,23 @@ from es_service.config.model import Kept, RunConfig
 from es_service.config.text import in_line, one_of, plain, show
 from es_service.errors import ConfigError, Problem, StoreError, counted
 from es_service.runs.checked_config import KNOWN, accepted, changes_from
+from es_service.runs.setting_words import settings_words
 from es_service.runs.view import open_run
 from es_service.store.folder import holds_run
 
-SEED = "seed"
+SEED, ENVIRONMENT = "seed", "task.environment"
 Grid = Mapping[str, Sequence[Any]]
 """Key of the config -> its values; a sweep has every combination of them."""
 _MOST_CHARACTERS = 60
 """Longest part of a run's name that is made of one value, since the name of a folder has at most 255 characters."""
+
+
+class Labelled(NamedTuple):
+    """A config of a sweep of several, each of which is a group that is compared with the others."""
+
+    label: str
+    """Name of the group, which several configs may have: one for each task."""
+    source: Source
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,10 @@ class PlannedRun:
     config: RunConfig
     left_out: Mapping[str, str] = field(default_factory=dict)
     """Keys that the sweep sets for other runs only -> the method, or kind of a part, of this run that lacks the key."""
+    source: Source = ""
+    """What its config was made from."""
+    group: str = ""
+    """Name of the runs with which it is compared as one group; empty if the sweep has no other."""
 
 
 def left_out_notes(planned: Sequence[PlannedRun]) -> list[str]:
@@ -52,7 +66,7 @@ def left_out_notes(planned: Sequence[PlannedRun]) -> list[str]:
 
 
 def plan(
-    source: Source,
+    source: Source | Sequence[Labelled],
     out: Path,
     grid: Grid = MappingProxyType({}),
     seeds: Iterable[int] | None = None,
@@ -67,6 +81,7 @@ def plan(
     run for all of its values.
 
     Args:
+        source: a config, or several with labels; each of these has all runs of the grid and the seeds.
         out: folder in which each run has a folder.
         seeds: None: the seed of the config.
         overrides: settings of all runs.
@@ -84,52 +99,84 @@ def plan(
     by_seed = {} if seeds is None else {SEED: plain(list(seeds))}
     axes = {key: plain(list(values)) for key, values in grid.items()} | by_seed
     problems += _axis_problems(axes, SEED in grid, common)
+    alone = isinstance(source, str | os.PathLike | Mapping)
+    configs = [Labelled("", source)] if alone else list(source)
+    which = ", ".join(_title(config.source) for config in configs)
     if problems:
-        raise _refused(source, problems)
-    combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
-    idle = [read(source, {**common, **settings}, KNOWN, new=False).idle for settings in combinations]
+        raise _refused(which, problems)
+    combinations = [
+        (at, dict(zip(axes, values, strict=True))) for at in range(len(configs)) for values in product(*axes.values())
+    ]
+    idle = [read(configs[at].source, {**common, **own}, KNOWN, new=False).idle for at, own in combinations]
     used = {
         key
-        for settings, without in zip(combinations, idle, strict=True)
-        for key in {**common, **settings}
+        for (_, own), without in zip(combinations, idle, strict=True)
+        for key in {**common, **own}
         if key not in without
     }
-    runs: dict[str, tuple[dict[str, Any], dict[str, str]]] = {}  # by their settings, since some may now be equal
-    for settings, without in zip(combinations, idle, strict=True):
+    runs: dict[tuple[int, str], _Settings] = {}  # by config and settings, since some may now be equal
+    for (at, settings), without in zip(combinations, idle, strict=True):
         gone = {key: lacks for key, lacks in without.items() if key in used}
         own = {key: value for key, value in settings.items() if key not in gone}
-        runs.setdefault(in_line(own), (own, gone))
-    named = {_name(own): (own, gone) for own, gone in runs.values()}
+        runs.setdefault((at, in_line(own)), _Settings(configs[at], own, gone))
+    prefixes = _prefixes(configs)
+    named = {prefixes[at] + _name(one.own): one for (at, _), one in runs.items()}
     if len(named) < len(runs):
         what = "two combinations of these values give folders with the same name; use a sweep for each"
-        raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
+        raise _refused(which, [Problem(f"{', '.join(axes)}: {what}")])
+    compared = [key for key, values in axes.items() if len(values) > 1 and key not in (SEED, ENVIRONMENT)]
     planned: list[PlannedRun] = []
     wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
     stays: dict[str, list[Kept]] = {}
-    for name, (settings, gone) in named.items():
-        wanted = {key: value for key, value in common.items() if key not in gone} | settings
+    for name, (config, own, gone) in named.items():
+        wanted = {key: value for key, value in common.items() if key not in gone} | own
         folder = out / name
-        reading = read(source, wanted, KNOWN, new=here and not holds_run(folder))
+        reading = read(config.source, wanted, KNOWN, new=here and not holds_run(folder))
         for key, value in reading.kept.items():
             if len(grid.get(value.replaced, ())) > 1:
                 stays.setdefault(key, []).append(value)
+        group = ", ".join(
+            filter(None, [config.label, settings_words({key: own[key] for key in compared if key in own})])
+        )
         try:
-            planned.append(PlannedRun(name, folder, wanted, accepted(reading.config()), gone))
+            planned.append(PlannedRun(name, folder, wanted, accepted(reading.config()), gone, config.source, group))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
     named_already = {problem.field for problem in wrong.values()}
     wrong |= {key: _kept_problem(key, values) for key, values in stays.items() if key not in named_already}
     if wrong:
-        raise _refused(source, list(wrong.values()))
+        raise _refused(which, list(wrong.values()))
     for run in planned if here else ():
         _require_same_constants(run)
     return planned
 
 
-def _refused(source: Source, problems: Sequence[Problem]) -> ConfigError:
-    count = counted(len(problems), "problem")
-    return ConfigError.listing(f"{'config' if isinstance(source, Mapping) else source}: {count}", problems)
+class _Settings(NamedTuple):
+    config: Labelled
+    own: dict[str, Any]
+    """The keys of the grid, and the seed."""
+    gone: dict[str, str]
+    """See `PlannedRun.left_out`."""
+
+
+def _title(source: Source) -> str:
+    return "config" if isinstance(source, Mapping) else str(source)
+
+
+def _prefixes(configs: Sequence[Labelled]) -> list[str]:
+    """What the names of the runs of each config begin with: its label, and the name of its file if several have the
+    same label."""
+    labels = [config.label for config in configs]
+    texts = [
+        f"{label}_{Path(_title(config.source)).stem}" if labels.count(label) > 1 else label
+        for label, config in zip(labels, configs, strict=True)
+    ]
+    return [f"{_in_name(text)}_" if text else "" for text in texts]
+
+
+def _refused(which: str, problems: Sequence[Problem]) -> ConfigError:
+    return ConfigError.listing(f"{which}: {counted(len(problems), 'problem')}", problems)
 
 
 def _axis_problems(axes: Mapping[str, Sequence[Any]], has_seed: bool, common: Mapping[str, Any]) -> list[Problem]:

@@ -19,6 +19,7 @@ from es_service.report.figures import empty_figure, write_figures
 from es_service.report.floor import beside_walls
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
+from es_service.runs.folders import GROUPS, INSIDE, write_groups
 from es_service.search.maps.behaviour_map import BehaviourMap
 from tests.database import execute
 from tests.es_service.test_report_page import EVIL, Elements, task_with
@@ -49,11 +50,33 @@ def test_runs_are_grouped_by_what_differs_but_the_seed(runs, tmp_path):
     assert [(group.name, len(group.runs)) for group in compare.grouped(runs)] == [("me_es", 3), ("es", 3)]
     wide = read_run(write_run(tmp_path / "wide", {"search.sigma": 0.5}))
     names = [group.name for group in compare.grouped([runs[0], runs[1], wide])]
-    assert names == ["search.sigma 0.02", "search.sigma 0.5"]
-    assert [group.name for group in compare.grouped([runs[0], wide], ["seed"])] == ["seed 0"]
+    assert names == ["sigma = 0.02", "sigma = 0.5"]
+    assert [group.name for group in compare.grouped([runs[0], wide], ["seed"])] == ["seed = 0"]
     assert [group.name for group in compare.grouped(runs[:3])] == ["me_es"]
     # The algorithm alone does not explain these, since two groups have the same.
     assert len(compare.grouped([*runs, wide])) == 3
+
+
+def test_runs_of_one_sweep_are_grouped_as_it_has_named_them(tmp_path):
+    inside = tmp_path / "one" / INSIDE
+    inside.mkdir(parents=True)
+    folders = [
+        write_run(tmp_path / top / name, {"search.sigma": sigma, "policy.hidden": hidden})
+        for top, name, sigma, hidden in (("one", "a", 0.02, [8]), ("one", "b", 0.5, [16]), ("two", "c", 0.5, [16]))
+    ]
+    write_groups(inside, {"a": "small", "b": ""})
+    write_groups(inside, {"b": "large"})
+    named = [read_run(folder) for folder in folders]
+    assert [run.group for run in named] == ["small", "large", ""]
+    assert [group.name for group in compare.grouped(named[:2])] == ["small", "large"]
+    assert [group.name for group in compare.grouped(named[:2], ["search.sigma"])] == ["sigma = 0.02", "sigma = 0.5"]
+    other = replace(named[2], group="large")  # of another sweep, whose groups may have the same names
+    names = ["hidden = [8], sigma = 0.02", "hidden = [16], sigma = 0.5"]
+    assert [group.name for group in compare.grouped([*named[:2], other])] == names
+    (inside / GROUPS).write_text('{"a": 3, "b": ["x"]}')
+    assert [read_run(folder).group for folder in folders] == ["", "", ""]
+    (inside / GROUPS).write_text("[" * 100_000)
+    assert read_run(folders[0]).group == ""
 
 
 def test_runs_of_different_tasks_are_refused(runs, tmp_path):

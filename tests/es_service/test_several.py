@@ -234,5 +234,5 @@ def test_the_report_of_a_sweep_over_an_option_of_the_task_groups_by_it(tmp_path)
     code, printed, _ = es("report", tmp_path / "sweep")
     assert code == 0, printed
     page = (tmp_path / "sweep" / "report.html").read_text()
-    assert "task.options.start default" in page
-    assert "task.options.start corner" in page
+    assert "start = default" in page
+    assert "start = corner" in page

@@ -6,6 +6,7 @@ Sweeps themselves are in `tests/system/test_sweep.py`.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,10 +23,11 @@ from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
 from es_service.runs import sweep_commands, sweep_cores
+from es_service.runs.setting_words import settings_words
 from es_service.runs.sweep import INSIDE, SweptRun, sweep
 from es_service.runs.sweep_commands import Certifying, command_of
 from es_service.runs.sweep_cores import divide, share
-from es_service.runs.sweep_plan import left_out_notes, plan
+from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
 from tests.es_service.config_examples import MINIMAL
 from tests.run_examples import write_run
 
@@ -54,7 +56,7 @@ def test_a_grid_and_seeds_of_numpy_are_those_of_python(tmp_path):
 def test_a_larger_sweep_has_the_runs_of_the_smaller_one(tmp_path):
     small = plan(MINIMAL, tmp_path, {"search.sigma": [0.1]}, [1])
     large = plan(MINIMAL, tmp_path, {"search.sigma": [0.05, 0.1]}, range(3))
-    assert all(run in large for run in small)
+    assert all(replace(run, group="sigma = 0.1") in large for run in small)  # one value is no name
 
 
 def test_a_key_that_only_some_methods_of_a_sweep_have_is_left_out_for_the_others(tmp_path):
@@ -79,6 +81,36 @@ def test_a_key_that_only_some_methods_of_a_sweep_have_is_left_out_for_the_others
         plan(MINIMAL, tmp_path, {"search.algorithm": ["es", "ns_es"]}, None, ["search.batch=3"])
     with pytest.raises(ConfigError, match=r"search\.typo"):
         plan(MINIMAL, tmp_path, grid, None, ["search.typo=3"])
+
+
+def test_every_config_of_several_is_a_group_with_settings_of_its_own(tmp_path):
+    configs = [Labelled("evolution strategy", MINIMAL), Labelled("MAP-Elites", "point_maze_map_elites")]
+    runs = plan(configs, tmp_path, {"policy.hidden": [[8], [16]]}, range(2), ["budget.generations=4"])
+    assert len(runs) == 8
+    assert [run.name for run in runs[::4]] == ["evolution-strategy_hidden=8_seed=0", "MAP-Elites_hidden=8_seed=0"]
+    assert [run.group for run in runs[::2]] == [
+        f"{label}, hidden = [{size}]" for label in ("evolution strategy", "MAP-Elites") for size in (8, 16)
+    ]
+    assert {run.config.search.algorithm for run in runs[4:]} == {"map_elites"}
+    assert {run.config.budget.generations for run in runs} == {4}
+    # A key of one of the methods is left out for the other, and one that none of them has is refused.
+    left = plan(configs, tmp_path, {"search.sigma": [0.1, 0.2]})
+    assert [run.group for run in left] == [
+        *(f"evolution strategy, sigma = {sigma}" for sigma in (0.1, 0.2)),
+        "MAP-Elites",
+    ]
+    with pytest.raises(ConfigError, match=r"search\.emitters: 3 has no effect"):
+        plan(configs, tmp_path, {}, None, ["search.emitters=3"])
+    same = [Labelled("A", "point_maze_es"), Labelled("A", "ant_maze_me_es")]
+    assert [run.name for run in plan(same, tmp_path)] == ["A_point_maze_es_run", "A_ant_maze_me_es_run"]
+    with pytest.raises(ConfigError, match="folders with the same name"):
+        plan([configs[0], configs[0]], tmp_path)
+
+
+def test_settings_are_named_in_words():
+    settings = {"search.algorithm": "me_es", "novelty.newest": None, "search.sigma": 0.1, "map.correct_every": None}
+    assert settings_words(settings) == "me_es, newest = no limit, sigma = 0.1, correct_every = never"
+    assert settings_words({"search.a": 1, "map.a": None}) == "search.a = 1, map.a = none"
 
 
 def test_all_problems_of_all_runs_are_one_message(tmp_path):
@@ -169,6 +201,7 @@ def test_values_are_split_at_the_commas_between_them_alone(values):
 def test_options_that_contradict_each_other_are_refused(tmp_path):
     for words, message in (
         (("sweep", "point_maze_es", "--out", tmp_path / "a"), "a sweep needs --grid KEY=A,B or --seeds A:B"),
+        (("sweep", "a", "b", "--out", tmp_path / "a", "--label", "c"), "--label: there are 1 for 2 configs"),
         (("run", "point_maze_es", "--seeds", "0:2", "--seed", 1), "--seed and --seeds cannot be combined"),
         (("run", "point_maze_es", "--seeds", "0:2", "--set", "search.sigma=x", "--out", tmp_path), "sigma: x is not"),
     ):

@@ -81,7 +81,7 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
         tmp_path / "two.html"
     ]
     page = (out / "report.html").read_text()
-    assert all(f"search.sigma {sigma}" in page for sigma in (0.02, 0.05))
+    assert all(f"sigma = {sigma}" in page for sigma in (0.02, 0.05))
 
     (blocked / "notes.txt").unlink()
     untouched = [path for name in (*NAMES[:2], NAMES[3]) for path in (out / name).iterdir()]
