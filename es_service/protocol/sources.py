@@ -290,16 +290,29 @@ def model_files(model: Path) -> list[Path]:
     """
     found, folders = [model], {model.parent: None}
     for file in found:
-        try:
-            elements = list(ElementTree.fromstring(file.read_bytes()).iter()) if file.suffix == ".xml" else []
-        except ElementTree.ParseError:
-            elements = []
+        elements = _elements(file.read_bytes()) if file.suffix == ".xml" else []
         named = [element.get(f"{kind}dir") for element in elements for kind in ("mesh", "texture", "asset")]
         folders |= {model.parent / name: None for name in named if name}
-        read = [value for element in elements for key, value in element.items() if key.startswith("file")]
-        places = (Path(os.path.normpath(folder / name)) for name in read for folder in folders)
+        places = (Path(os.path.normpath(folder / name)) for name in _read_by(elements) for folder in folders)
         found += dict.fromkeys(place for place in places if place.is_file() and place not in found)
     return found
+
+
+def files_read(xml: bytes) -> list[str]:
+    """Names of the files that a model in MJCF reads: what it includes, meshes, textures."""
+    return _read_by(_elements(xml))
+
+
+def _elements(xml: bytes) -> list[ElementTree.Element]:
+    """All elements of an XML; none if it cannot be read."""
+    try:
+        return list(ElementTree.fromstring(xml).iter())
+    except ElementTree.ParseError:
+        return []
+
+
+def _read_by(elements: list[ElementTree.Element]) -> list[str]:
+    return [value for element in elements for key, value in element.items() if key.startswith("file")]
 
 
 def _beside(source: str, relative: str) -> str:

@@ -25,8 +25,8 @@ from workers.simd.episodes.kernel import compile_kernel
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")]
 EPISODES, REPEATS = 500, 4
 """Episodes of Gymnasium, and how many of ours there are for each."""
-STEPS = {"Ant-v5": 300}
-"""Most steps of an episode, where they are fewer than Gymnasium's: C MuJoCo needs minutes for more."""
+STEPS = {"Ant-v5": 300, "ant_maze": 1000}
+"""Most steps of an episode, where they are fewer than the task's: C MuJoCo needs minutes for more."""
 SIGMA = {"Ant-v5": 0.01}
 """Perturbations of the training, and its step, where they are not 0.05: an ant that stands falls over with more."""
 SEEN = 27
@@ -70,7 +70,7 @@ class Pair(NamedTuple):
 def pair_of(name: str) -> Pair:
     if name in ANTS:
         theirs = gymnasium.make(f"es_service.gymnasium:es_service/{ANTS[name]}").unwrapped
-        ours, steps = make_environment(name, {"physics": "mujoco"}), SHIPPED[name].episode_steps
+        ours, steps = make_environment(name, {"physics": "mujoco"}), STEPS.get(name, SHIPPED[name].episode_steps)
         return Pair(name, ours, theirs, lambda _, info: info["descriptor"], steps)
     theirs, ours = gymnasium.make(name).unwrapped, make_environment(f"mujoco:{name}", {})
     *_, places = next(iter(mujoco_gym._descriptors(theirs.model).values()))

@@ -118,6 +118,48 @@ class NoFrames(Slider):
     frame_skip = 0
 
 
+class TrueFrames(Slider):
+    frame_skip = True
+
+
+class TextDescriptor(Slider):
+    def descriptor(self, data):
+        return "high"
+
+
+class FloatDone(Slider):
+    def done(self, data):
+        return data.qpos[0]
+
+
+class ManyArguments(Slider):
+    def done(self, data, earlier, later):
+        return data.qpos[0] > 0.1
+
+
+class DrawsByJax(Slider):
+    def reset(self, key):
+        return jax.random.normal(key, (1,)), jnp.zeros(1)
+
+
+class NoActuator(Slider):
+    model = XML.replace('<motor ctrlrange="-2 4" gear="50" joint="x"/>', "")
+
+
+class NoSuchJoint(Slider):
+    model = XML.replace('gear="50" joint="x"', 'gear="50" joint="elbow"')
+
+
+class MeshOfText(Slider):
+    model = XML.replace("<worldbody>", '<asset><mesh file="t.obj"/></asset><worldbody>')
+
+
+class BeyondMjx(Slider):
+    """MJX has rays, but not without materials."""
+
+    model = XML.replace("<jointpos", '<rangefinder site="tip"/><jointpos')
+
+
 @pytest.mark.parametrize(
     ("name", "sentences"),
     [
@@ -130,12 +172,22 @@ class NoFrames(Slider):
         ("NoFile", ["model = 'slider.xml': there is no file ", "relative to the folder of the class"]),
         ("OtherSolver", ["MJX lacks parts of this MuJoCo model: option solver = pgs; must be "]),
         ("NoFrames", ["frame_skip = 0 is not positive"]),
+        ("TrueFrames", ["frame_skip = True is not of type int"]),
+        ("TextDescriptor", ["descriptor returned 'high'; it must return one array"]),
+        ("FloatDone", ["done returned float32; it must return bool, such as data.qpos[2] < 0.2"]),
+        ("ManyArguments", ["done has the parameters (data, earlier, later); it is called as done(data, earlier)"]),
+        ("DrawsByJax", ["reset(key) passes its key to jax.random", "noise.uniforms(key, counters), or a key of JAX"]),
+        ("NoActuator", ["the model has no actuator, so a policy could do nothing; give it an element <actuator>"]),
+        ("NoSuchJoint", ["MuJoCo cannot read its XML: unknown transmission target 'elbow'"]),
+        ("MeshOfText", ["its XML reads the file t.obj, which would be no part", "a file beside the module and name"]),
+        ("BeyondMjx", ["MJX cannot compute this model: TypeError: Slice size"]),
     ],
 )
 def test_what_is_wrong_is_named(name, sentences):
     with pytest.raises(TaskError) as raised:
         describe_environment(f"{__name__}:{name}")
     assert str(raised.value).startswith(f"{__name__}:{name}")
+    assert "\n" not in str(raised.value), "one sentence"
     for sentence in sentences:
         assert sentence in str(raised.value)
 
@@ -176,6 +228,9 @@ def test_the_files_of_a_model_are_code(tmp_path, monkeypatch):
         before = after
     with pytest.raises(TaskError, match=r"hidden.xml would be no part of the run's identity.*model = \"hidden.xml\""):
         describe_environment("robots.slide:Hidden")
+    (tmp_path / "robots/models/m/t.obj").unlink()
+    with pytest.raises(TaskError, match=r"cannot read models/slide.xml: .*t\.obj'; names in a model are relative to"):
+        describe_environment("robots.slide:Slide")
     for module in ("robots", "robots.slide"):
         sys.modules.pop(module, None)
 

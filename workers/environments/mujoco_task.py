@@ -12,7 +12,7 @@
 
 It may also have:
 
-- `done(self, data)`: whether the episode ends here;
+- `done(self, data)`: whether the episode ends here, as bool;
 - `observe(self, data)`: the observation, one array of any length; else positions, velocities and activations;
 - `reset(self, key)`: positions [nq] and velocities [nv] of a new episode from a stream key, of which
   `es_service.protocol.noise.uniforms(key, counters)` makes random numbers; else those of the model's first key frame,
@@ -36,6 +36,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
@@ -48,7 +49,7 @@ import numpy as np
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
-from es_service.protocol.sources import model_files, modules_of
+from es_service.protocol.sources import files_read, model_files, modules_of
 from workers.environments import Environment, TaskError
 from workers.environments.c_mujoco import ControlStep
 from workers.environments.declared import (
@@ -69,10 +70,21 @@ from workers.environments.mujoco_parts import (
     start,
     step,
 )
-from workers.environments.user_task import shown, tracing, wrong_types
+from workers.environments.user_task import reset_of, shown, tracing, wrong_types
 
 ATTRIBUTES = {"frame_skip": int, "episode_steps": int, "descriptor_names": tuple, "descriptor_bounds": tuple}
 NEEDED = ("model", *ATTRIBUTES, "reward", "descriptor")
+EARLIER = "earlier"
+"""An argument that a function may do without."""
+ARGUMENTS = {
+    **dict.fromkeys(("reward", "done"), ("data", EARLIER)),
+    **dict.fromkeys(("descriptor", "observe", "goal_distance"), ("data",)),
+    "success": ("data", "before"),
+    "reset": ("key",),
+}
+"""Function of a class -> what it is called with."""
+CONDITIONS = ("done", "success")
+"""Functions that return bool."""
 KNOWN = (*NEEDED, *OF_EVERY_CLASS, "done", "observe", "reset")
 
 
@@ -125,6 +137,8 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
     """
     own = construct(task, options)
     model = _load(path, task, own.model)
+    if not model.nu:
+        raise TaskError("the model has no actuator, so a policy could do nothing; give it an element <actuator>")
     own.mj_model = model
     mx = put_model(model)
     first_qpos, first_qvel = (model.key_qpos[0], model.key_qvel[0]) if model.nkey else (model.qpos0, np.zeros(model.nv))
@@ -133,24 +147,33 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
         jnp.asarray(np.where(limited, bounds, side), jnp.float32)
         for bounds, side in zip(model.actuator_ctrlrange.T, (-1.0, 1.0), strict=True)
     )
-    wants_earlier = {name: _takes_two(getattr(own, name, None)) for name in ("reward", "done")}
+    wanted = {name: _wanted(own, name) for name in ARGUMENTS if hasattr(own, name)}
+    own_reset = reset_of(own) if hasattr(own, "reset") else lambda key: (first_qpos, first_qvel)
 
     def ctrl(action: Any) -> Any:
         return jnp.clip(0.5 * (low_A + high_A) + 0.5 * (high_A - low_A) * action, low_A, high_A)
 
+    def implied(physics: MujocoState, ctrl_A: Any) -> Any:
+        try:
+            return forward(mx, physics, ctrl_A)
+        except Exception as error:  # MJX finds out only here what it cannot do
+            raise TaskError(f"MJX cannot compute this model: {type(error).__name__}: {error}") from error
+
     def say(name: str, shape: tuple[int, ...] | None, *arguments: Any) -> Any:
         """What a function of the user's returns, one array of this shape; of one axis if None."""
-        result = getattr(own, name)(*arguments)
-        if result is None or isinstance(result, dict):
+        result = getattr(own, name)(*arguments[: wanted[name]])
+        if result is None or isinstance(result, dict | str):
             raise TaskError(f"{name} returned {shown(result)}; it must return one array")
         array = jnp.asarray(result)
+        if name in CONDITIONS and array.dtype != bool:
+            raise TaskError(f"{name} returned {array.dtype}; it must return bool, such as data.qpos[2] < 0.2")
         if array.shape != shape and not (shape is None and array.ndim == 1):
             should = f"must be {shape}" if shape is not None else "must have one axis, (length,)"
             raise TaskError(f"{name} returned an array of the shape {array.shape}; it {should}")
         return array
 
     def say_of_step(name: str, data: Any, before: TaskState) -> Any:
-        earlier = (forward(mx, before.physics, before.ctrl),) if wants_earlier[name] else ()
+        earlier = (implied(before.physics, before.ctrl),) if wanted[name] > 1 else ()
         return say(name, (), data, *earlier)
 
     def look(physics: MujocoState, ctrl_A: Any, data: Any) -> TaskState:
@@ -168,11 +191,11 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
             observation_O.astype(jnp.float32),
             say("descriptor", (len(task.descriptor_names),), data).astype(jnp.float32),
             jnp.asarray(distance, jnp.float32),
-            jnp.stack([succeeds(jnp.bool_(False)), succeeds(jnp.bool_(True))]).astype(bool),
+            jnp.stack([succeeds(jnp.bool_(False)), succeeds(jnp.bool_(True))]),
         )
 
     def reset(key: Any) -> TaskState:
-        qpos, qvel = _pair(own.reset(key)) if hasattr(own, "reset") else (first_qpos, first_qvel)
+        qpos, qvel = _pair(own_reset(key))
         for what, array, size in (("positions", qpos, "nq"), ("velocities", qvel, "nv")):
             if jnp.shape(array) != (getattr(model, size),):
                 raise TaskError(
@@ -180,14 +203,14 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
                     f"{size} of the model"
                 )
         physics, nothing = start(mx, qpos, qvel), jnp.zeros(model.nu, jnp.float32)
-        return look(physics, nothing, forward(mx, physics, nothing))
+        return look(physics, nothing, implied(physics, nothing))
 
     def one_step(before: TaskState, action: Any) -> tuple[TaskState, Any, Any]:
         ctrl_A = ctrl(action)
         physics = step(mx, before.physics, ctrl_A, task.frame_skip)
-        data = forward(mx, physics, ctrl_A)
+        data = implied(physics, ctrl_A)
         reward = say_of_step("reward", data, before).astype(jnp.float32)
-        done = say_of_step("done", data, before).astype(bool) if hasattr(own, "done") else jnp.bool_(False)
+        done = say_of_step("done", data, before) if hasattr(own, "done") else jnp.bool_(False)
         return look(physics, ctrl_A, data), reward, done
 
     return Environment(
@@ -211,9 +234,18 @@ def _pair(result: Any) -> tuple[Any, Any]:
     return qpos, qvel
 
 
-def _takes_two(function: Callable[..., Any] | None) -> bool:
-    """Whether a method of the user's has a parameter for the data before the control step."""
-    return function is not None and len(inspect.signature(function).parameters) > 1
+def _wanted(own: Any, name: str) -> int:
+    """How many of its ARGUMENTS a function of the user's takes.
+
+    Raises:
+        TaskError: it cannot be called with them.
+    """
+    signature, arguments = inspect.signature(getattr(own, name)), ARGUMENTS[name]
+    for count in (len(arguments), len(arguments) - (arguments[-1] == EARLIER)):
+        with suppress(TypeError):
+            signature.bind(*arguments[:count])
+            return count
+    raise TaskError(f"{name} has the parameters {signature}; it is called as {name}({', '.join(arguments)})")
 
 
 def _load(path: str, task: Any, given: Any) -> MjModel:
@@ -230,6 +262,11 @@ def _load(path: str, task: Any, given: Any) -> MjModel:
     if isinstance(given, mujoco.MjSpec):
         return _compiled("its MjSpec", given.compile)
     if isinstance(given, str) and given.lstrip().startswith("<"):
+        if files := files_read(given.encode()):
+            raise TaskError(
+                f"its XML reads the file {files[0]}, which would be no part of the run's identity; write the XML into "
+                'a file beside the module and name that: model = "robot.xml"'
+            )
         return _compiled("its XML", lambda: mujoco.MjModel.from_xml_string(given))
     if not isinstance(given, str | Path):
         raise TaskError(f"model = {given!r} is neither the name of a file, XML, an MjSpec nor an MjModel")
@@ -255,4 +292,6 @@ def _compiled(what: str, compile_: Callable[[], MjModel]) -> MjModel:
     try:
         return compile_()
     except (ValueError, mujoco.FatalError) as error:
-        raise TaskError(f"MuJoCo cannot read {what}: {error}") from error
+        why = " ".join(str(error).removeprefix("Error: ").split())
+        hint = "; names in a model are relative to its folder, or to its meshdir and the like"
+        raise TaskError(f"MuJoCo cannot read {what}: {why}{hint if 'opening file' in why else ''}") from error

@@ -136,7 +136,7 @@ def wrong_types(task: Any, attributes: Mapping[str, type]) -> list[str]:
     return [
         f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
         for name, type_ in attributes.items()
-        if not isinstance(getattr(task, name), type_)
+        if not isinstance(value := getattr(task, name), type_) or isinstance(value, bool)
     ]
 
 
@@ -187,7 +187,7 @@ def shown(result: Any) -> str:
     """What a method has returned, in a message: the structure, since the numbers are not known while JAX traces."""
     if result is None:
         return "None (is a `return` missing?)"
-    return str(jax.tree.map(lambda _: "*", result)).replace("'*'", "*")
+    return repr(result) if isinstance(result, str) else str(jax.tree.map(lambda _: "*", result)).replace("'*'", "*")
 
 
 def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
@@ -223,6 +223,16 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
             raise TaskError(f"observe returned {shown(None)}; it must return one array")
         return jnp.asarray(observation, jnp.float32)
 
+    viewer = task.viewer() if hasattr(task, "viewer") else None
+    success = getattr(task, "success", lambda state, before: before)
+    return words_in_place_of_keys(
+        Environment(reset_of(task), observe, step, task.descriptor, goal_distance, success, viewer=viewer)
+    )
+
+
+def reset_of(task: Any) -> Callable[[Any], Any]:
+    """The user's reset, which says what to do if it passes its key to `jax.random`."""
+
     def reset(key: Any) -> Any:
         try:
             return task.reset(key)
@@ -231,11 +241,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
                 raise TaskError(JAX_KEY_WANTED) from error
             raise
 
-    viewer = task.viewer() if hasattr(task, "viewer") else None
-    success = getattr(task, "success", lambda state, before: before)
-    return words_in_place_of_keys(
-        Environment(reset, observe, step, task.descriptor, goal_distance, success, viewer=viewer)
-    )
+    return reset
 
 
 def _wants_jax_key(error: Exception) -> bool:
