@@ -25,6 +25,7 @@ from es_service.config.model import RunConfig
 from es_service.config.tasks import CALLER, task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
+from es_service.protocol.child import require_same_process
 from es_service.protocol.evaluator import Session
 from es_service.protocol.messages import (
     ChunkResult,
@@ -35,7 +36,6 @@ from es_service.protocol.messages import (
     Work,
     WorkerSpec,
 )
-from es_service.protocol.parent import require_same_process
 from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
 from es_service.runs.session import OnNotice, Outcome, warn

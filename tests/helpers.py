@@ -22,7 +22,7 @@ from es_service.loop.history import NO_INTEGER
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
-from workers.recording import record
+from workers.recording import recorder
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(
@@ -138,7 +138,9 @@ def workers_in_this_process() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in ("session", "evaluation", "verification"):
             patch.setattr(f"es_service.runs.{module}.inline_engine", inline_here)
-        patch.setattr("es_service.runs.replay._answer", lambda question: record(*question))
+        patch.setattr(
+            "es_service.runs.replay.answer_of", lambda _, *given, request, limit_s: recorder(*given)(*request)
+        )
         yield
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
-from es_service.protocol.newest_output import NewestOutput
+from es_service.protocol.newest_output import newest_output
 from es_service.protocol.process_environment import DEPTH, worker_environment
 from es_service.protocol.raised import sendable
 from es_service.protocol.sources import OtherCodeError, why_refused
@@ -68,10 +68,9 @@ class WorkerActor:
                 than the run's.
         """
         spec = pickle.loads(self._spec)
-        output = NewestOutput(spec.output_bytes // 2)  # Ray has a file for each of the two
-        for descriptor in (1, 2):
+        for descriptor in (1, 2):  # Ray has a file for each of the two
             with suppress(OSError):  # a Ray that takes the output through a pipe has limits of its own
-                output.add(descriptor)
+                newest_output().add(descriptor, spec.output_bytes // 2)
         if problem := why_refused(spec.sources, spec.task_code, spec.platform):
             raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)

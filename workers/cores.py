@@ -16,10 +16,10 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
+from es_service.protocol.child import end_with
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.kept_parents import with_made_policies
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
-from es_service.protocol.parent import end_with
 from es_service.protocol.raised import sendable
 from workers import progress
 from workers.compilable import Compilable

@@ -1,10 +1,7 @@
 """Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX, or code
 of the user.
 
-    python -m workers.describe NAME SETTINGS ANSWER
-
-SETTINGS is JSON, what `describe_environment` of `workers.environments` takes.
-Writes JSON to the file ANSWER: {"task": fields of a TaskSpec} or {"problem": text}.
+    python -m workers.describe DESCRIPTOR     # run by `es_service.protocol.child`
 """
 
 from __future__ import annotations
@@ -12,16 +9,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+from es_service.protocol.child import answer_parent
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.options import option_values
-from es_service.protocol.parent import end_soon, write_answer
+from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.sources import SUITES
 from workers.environments import TaskError, choices_of, describe_environment
-from workers.host.repeats import tried_apart
+from workers.host.repeats import does_not_repeat
 from workers.rollouts import BACKENDS
 
 
@@ -46,24 +43,36 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
     )
 
 
-def main(name: str, settings: str, file: str) -> None:
-    """Write the description of a task, or the problem with it, as JSON to a file."""
-    try:
-        given = json.loads(settings)
-        task = described(name, given)
-        if task.kind == "python":
-            options = option_values(task.options, given.get("options", {}))
-            task = dataclasses.replace(task, does_not_repeat=tried_apart(task, options, choices_of(given)))
-        elif task.kind == "jax" and name.partition(":")[0] not in ("brax", "mujoco", *SUITES):
-            from workers.traces import require_pure
+def descriptions(name: str, settings: Mapping[str, Any]) -> Callable[[str], Any]:
+    """Function that answers "task" with the fields of a TaskSpec as JSON, which needs no class of the user's, or
+    {"problem": text}; and then "repeats" with where a task of Python objects was found not to repeat itself.
 
-            require_pure(task, option_values(task.options, given.get("options", {})))
-        answer = {"task": dataclasses.asdict(task)}
-    except TaskError as error:
-        answer = {"problem": str(error)}
-    write_answer(file, json.dumps(answer).encode())
+    Args:
+        name, settings: see `describe_environment`.
+    """
+    task: TaskSpec | None = None
+
+    def options() -> Mapping[str, OptionValue]:
+        assert task is not None, "it has been described"
+        return option_values(task.options, settings.get("options", {}))
+
+    def answer(question: str) -> str:
+        nonlocal task
+        if question == "repeats":
+            assert task is not None, "it has been described"
+            return does_not_repeat(task, options(), choices_of(settings))
+        try:
+            task = described(name, settings)
+            if task.kind == "jax" and name.partition(":")[0] not in ("brax", "mujoco", *SUITES):
+                from workers.traces import require_pure
+
+                require_pure(task, options())
+            return json.dumps({"task": dataclasses.asdict(task)})
+        except TaskError as error:
+            return json.dumps({"problem": str(error)})
+
+    return answer
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
-    end_soon()
+    answer_parent(int(sys.argv[1]), descriptions)

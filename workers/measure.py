@@ -1,19 +1,17 @@
 """Measure the speed of a task on one core, in a separate process that `es-service bench rollouts` starts.
 
-    python -m workers.measure JSON      # the arguments of `measure`
-
-Prints one line of JSON.
+python -m workers.measure DESCRIPTOR     # run by `es_service.protocol.child`
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from es_service.protocol.child import answer_parent
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol.rollouts import why_not
@@ -104,10 +102,5 @@ def _with_policy(
     return call
 
 
-def main(arguments: str) -> None:
-    """Print the result of `measure` for arguments in JSON."""
-    print(json.dumps(measure(**json.loads(arguments))))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1])
+    answer_parent(int(sys.argv[1]), lambda task, given: lambda: measure(task, **given))

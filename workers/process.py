@@ -22,7 +22,6 @@ from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.kept_subjects import forget_old_subjects
 from es_service.protocol.messages import Subject, WorkerSpec
-from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
@@ -40,7 +39,7 @@ REPORT_S = 0.5
 """Seconds between two looks at how far a worker is. Nothing is sent of work that is done sooner."""
 
 
-def main(descriptor: int, parent: int) -> None:
+def main(descriptor: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
@@ -52,7 +51,7 @@ def main(descriptor: int, parent: int) -> None:
     ("compiled", kind, seconds). While it takes long for something, its start included, it sends ("progress", doing,
     done, total) as in `progress.Seen` when it has done more of it.
     """
-    end_with(parent)
+    os.set_inheritable(descriptor, False)
     with socket.socket(fileno=descriptor) as control:
         try:
             spec = receive(control)
@@ -189,4 +188,4 @@ class _Said:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(int(sys.argv[1]))

@@ -1,37 +1,30 @@
 """Record evaluation episodes for replays, in a separate process because most rollouts import JAX.
 
-    python -m workers.recording REQUESTS ANSWER
-
-REQUESTS is a file with the pickled (WorkerSpec, [RecordRequest]); the pickled Recordings are written to ANSWER.
+python -m workers.recording DESCRIPTOR     # run by `es_service.protocol.child`
 """
 
 from __future__ import annotations
 
 import os
-import pickle
 import sys
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
+from es_service.protocol.child import answer_parent
 from es_service.protocol.messages import WorkerSpec
-from es_service.protocol.parent import end_soon, write_answer
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers.rollouts import BACKENDS
 from workers.xla_cache import xla_cache_settings
 
 
-def record(spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
-    """Record the requested episodes with the run's own rollout, so that they have the bits of the run's own."""
-    return BACKENDS[spec.rollout].record(spec, requests)
+def recorder(name: str, spec: WorkerSpec) -> Callable[[Sequence[RecordRequest]], Recordings]:
+    """Function that records episodes with the run's own rollout, so that they have the bits of the run's own.
 
-
-def main(requests: str, file: str) -> None:
-    """Answer the requests of a file."""
+    Args:
+        name: that of the task.
+    """
     os.environ.update(xla_cache_settings())
-    spec, wanted = pickle.loads(Path(requests).read_bytes())
-    write_answer(file, pickle.dumps(record(spec, wanted)))
+    return lambda requests: BACKENDS[spec.rollout].record(spec, requests)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
-    end_soon()
+    answer_parent(int(sys.argv[1]), recorder)

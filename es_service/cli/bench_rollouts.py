@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -17,7 +14,9 @@ from es_service.config.tasks import ROLLOUTS, TASKS, read_options
 from es_service.config.text import did_you_mean_task, one_of, problem_of
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.child import Child, NoAnswerError
 from es_service.protocol.process_environment import child_environment
+from es_service.protocol.raised import RaisedError
 
 BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)
@@ -95,23 +94,16 @@ def _options(task: str, overrides: Overrides) -> dict[str, Any]:
 
 
 def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
-    command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
-    environment = child_environment()
-    measurements = []
-    with ExitStack() as ends:
-        started = []
-        for _ in range(count):
-            process = subprocess.Popen(
-                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
-            ends.enter_context(process)  # waits for it
-            ends.callback(process.kill)  # in case another process fails or a signal arrives
-            started.append(process)
+    with ExitStack() as ends:  # in case one fails or a signal arrives
+        started = [ends.enter_context(Child("workers.measure", child_environment())) for _ in range(count)]
         for process in started:
-            printed, errors = process.communicate()
-            if process.returncode:
-                raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
-            measurements.append(json.loads(printed.splitlines()[-1]))
+            process.ask(arguments["task"], {name: value for name, value in arguments.items() if name != "task"})
+            process.ask()
+        try:
+            measurements = [(process.answer(), process.answer())[1] for process in started]
+        except (NoAnswerError, RaisedError) as error:
+            why = f"its process {error}" if isinstance(error, NoAnswerError) else error
+            raise EvaluationError(f"{arguments['task']} cannot be measured: {why}") from None
     named = {"task": arguments["task"], "rollout": arguments["rollout"]}
     if "problem" in measurements[0]:
         return named | {"note": f"{arguments['rollout']} cannot run it: {measurements[0]['problem']}"}

@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from typing import Any, TypeGuard
 
@@ -19,6 +19,7 @@ from es_service.config.parts import LARGEST, TASK_OPTIONS
 from es_service.config.resolution import options_of
 from es_service.config.text import in_line, nearest, one_of, problem_of, show, wrong_value
 from es_service.errors import ConfigError, Problem
+from es_service.protocol.child import END_S, Child, NoAnswerError
 from es_service.protocol.messages import NO_CHOICES, UNBOUNDED, HostChoices, TaskSpec, with_options
 from es_service.protocol.options import (
     Option,
@@ -31,8 +32,8 @@ from es_service.protocol.options import (
     option_values,
 )
 from es_service.protocol.parameters import FREE, ParameterSpec
-from es_service.protocol.parent import answer_of
-from es_service.protocol.process_environment import require_no_import_of_a_task
+from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
+from es_service.protocol.raised import RaisedError
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import task_code, user_sources
 from workers import environments
@@ -79,6 +80,8 @@ CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode")
 """Keys of `HostChoices`."""
 DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
+REPEATS_S = 20.0
+"""Longest time of a trial whether it repeats itself."""
 
 
 def is_start(given: object, parameters: int) -> TypeGuard[list[float]]:
@@ -168,12 +171,18 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     Args:
         settings: what a config chooses for it, as JSON.
     """
-    told = answer_of([sys.executable, "-m", "workers.describe", name, settings], DESCRIBE_S)
-    if told.content is None:
-        if told.code is None:
-            raise ConfigError(f"{name} could not be imported and described within {DESCRIBE_S:g} s")
-        raise ConfigError(f"{name} could not be imported or described:\n{told.errors}")
-    answer = json.loads(told.content)
+    with Child("workers.describe", child_environment()) as child:
+        try:
+            child.call(name, json.loads(settings), limit_s=DESCRIBE_S)
+            answer = json.loads(child.call("task", limit_s=DESCRIBE_S))
+        except NoAnswerError as error:
+            raise ConfigError(f"{name} could not be imported and described: its process {error}") from None
+        except RaisedError as error:
+            raise ConfigError(f"{name} could not be imported or described:\n{error}") from None
+        if answer.get("task", {}).get("kind") == "python":
+            with suppress(NoAnswerError, RaisedError):  # a simulator may end its process or make it wait
+                answer["task"]["does_not_repeat"] = child.call("repeats", limit_s=REPEATS_S)
+        child.end(END_S)
     if "problem" in answer:
         problem = answer["problem"]
         named = re.match(r"(task\.(?:\w+|options\.\w+)) = ", problem)

@@ -30,9 +30,9 @@ from es_service.dispatch.scheduler_state import (
 from es_service.dispatch.waits import Waits
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
+from es_service.protocol.child import require_same_process
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
-from es_service.protocol.parent import require_same_process
 from es_service.protocol.pieces import pieces_of, together
 from es_service.protocol.policies import POLICY_SLOTS
 

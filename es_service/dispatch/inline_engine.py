@@ -10,18 +10,13 @@ from __future__ import annotations
 
 import os
 import select
-import signal
 import socket
-import subprocess
-import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import count
-from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
@@ -36,20 +31,17 @@ from es_service.dispatch.events import (
     with_last_words,
 )
 from es_service.dispatch.gpus import places
+from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
-from es_service.protocol.newest_output import NewestOutput
-from es_service.protocol.parent import guard_of, start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
-from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
+from es_service.protocol.wire import Channel, framed
 
 PIECE_S = 0.1
 """Longest wait in seconds for the next part of a message whose beginning has been received."""
-LAST_WORDS_BYTES = 2000
-"""At most this many bytes of a lost worker's output are reported."""
 
 
 def inline_engine(
@@ -75,27 +67,12 @@ def inline_engine(
 
 
 @dataclass(eq=False)
-class _Child:
-    """A child process of one worker, or of all workers if they are threads."""
-
-    process: subprocess.Popen[bytes]
-    log: IO[bytes]
-    """File with the newest part of the child's output on stdout and stderr."""
-    control: socket.socket
-    """Socket over which the child receives the sockets of its workers."""
-    place: str = ""
-    """The GPUs that it may use, as CUDA_VISIBLE_DEVICES names them."""
-    guard: subprocess.Popen[bytes] | None = None
-    """Ends the child's process group when the driver ends, for whatever reason."""
-    watched: int = -1
-    """Number of the file in `NewestOutput`."""
-
-
-@dataclass(eq=False)
 class _Worker:
     """A worker that is not known to be lost."""
 
-    child: _Child
+    child: Child
+    place: str
+    """The GPUs that the child may use, as CUDA_VISIBLE_DEVICES names them."""
     channel: Channel
     parents: KeptParents[int]
     """Sizes of the parents of policies that it keeps."""
@@ -114,7 +91,7 @@ class ChildProcesses:
         self._spec, self._threads = framed(spec), threads
         self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
         self._platforms: set[str] = set()
-        self._parent_cache_bytes, self._output = spec.parent_cache_bytes, NewestOutput(spec.output_bytes)
+        self._parent_cache_bytes, self._output_bytes = spec.parent_cache_bytes, spec.output_bytes
         self._workers: dict[int, _Worker] = {}
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
@@ -123,22 +100,23 @@ class ChildProcesses:
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
-        return {number: worker.child.process.pid for number, worker in self._workers.items()}
+        return {number: worker.child.pid for number, worker in self._workers.items()}
 
     def start(self, worker: int) -> None:
         """Start a child and send it the constants of the run; or have the existing child start another thread."""
         with ExitStack() as undo:
             try:
-                ours, theirs = map(undo.enter_context, _socket_pair())
+                ours, theirs = map(undo.enter_context, socket_pair())
                 running = next(iter(self._workers.values()), None) if self._threads else None
-                child = running.child if running is not None else self._start_child(undo)
-                socket.send_fds(child.control, [b"w"], [theirs.fileno()])
+                place = self._free_place() if running is None else running.place
+                child = undo.enter_context(self._start_child(place)) if running is None else running.child
+                socket.send_fds(child.socket, [b"w"], [theirs.fileno()])
             except OSError as error:  # no more processes, file descriptors or disk space, or the child has just ended
                 self._ready.append(WorkerLost(worker, f"worker {worker} cannot be started: {error}"))
                 return
             undo.pop_all()
         theirs.close()
-        self._add(worker, child, ours)
+        self._add(worker, child, ours, place)
         self._ready.append(Placed(worker))
 
     def kill(self, worker: int) -> str:
@@ -200,18 +178,20 @@ class ChildProcesses:
     def close(self) -> None:
         """Kill all children and wait until they have ended."""
         for worker in self._workers.values():
-            _kill(worker.child)  # kill all before waiting, since each takes some time to free its memory
+            worker.child.kill()  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
-        self._output.close()
 
-    def _start_child(self, undo: ExitStack) -> _Child:
-        """A new process, which gets the place at the GPUs that has the fewest workers."""
-        taken = [worker.child.place for worker in self._workers.values()]
-        free = min(self._places, key=lambda place: taken.count(place) / self._places.count(place), default="")
-        child = _start_child(self._spec, undo, self._gpus, free)
-        child.watched = self._output.add(child.log.fileno())
-        undo.callback(self._output.forget, child.watched)
+    def _free_place(self) -> str:
+        """The place at the GPUs that has the fewest workers."""
+        taken = [worker.place for worker in self._workers.values()]
+        return min(self._places, key=lambda place: taken.count(place) / self._places.count(place), default="")
+
+    def _start_child(self, place: str) -> Child:
+        """A new process that has been sent the constants of the run."""
+        child = Child("workers.process", child_environment(self._gpus, place), self._output_bytes)
+        child.socket.sendall(self._spec)
+        child.socket.setblocking(False)  # if it does not take its workers' sockets, they cannot be started
         return child
 
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
@@ -219,8 +199,8 @@ class ChildProcesses:
         number = next(self._numbers)
         return number, framed(("subject", number, as_sent(subject)))
 
-    def _add(self, number: int, child: _Child, ours: socket.socket) -> None:
-        self._workers[number] = _Worker(child, Channel(ours), KeptParents(self._parent_cache_bytes, int))
+    def _add(self, number: int, child: Child, ours: socket.socket, place: str = "") -> None:
+        self._workers[number] = _Worker(child, place, Channel(ours), KeptParents(self._parent_cache_bytes, int))
         self._by_descriptor[ours.fileno()] = number
         self._poll.register(ours, select.POLLIN)
 
@@ -276,14 +256,14 @@ class ChildProcesses:
             return raised(error)
         return None if is_open else RaisedError("", "")
 
-    def _forget(self, number: int) -> _Child:
+    def _forget(self, number: int) -> Child:
         worker = self._workers.pop(number)
         self._poll.unregister(worker.channel)
         del self._by_descriptor[worker.channel.fileno()]
         worker.channel.close()
         return worker.child
 
-    def _lose(self, child: _Child, reason: str = "", traceback: str = "", *, charge_items: bool = True) -> str:
+    def _lose(self, child: Child, reason: str = "", traceback: str = "", *, charge_items: bool = True) -> str:
         """Kill a child and report the loss of its remaining workers, after their messages; returns its last output.
 
         The item of a worker that had none is not charged with the loss: before the scheduler learns of the loss, it may
@@ -293,72 +273,13 @@ class ChildProcesses:
         for number in lost:
             self._hear(number)
             self._forget(number)
-        _kill(child)
-        self._output.forget(child.watched)
-        how, last_words = _end(child)
+        end = child.end()
         if not reason:
-            reason = f"worker {', '.join(map(str, lost))} (pid {child.process.pid}) ended with {how}"
-            reason += f":\n{last_words}" if last_words else ""
+            reason = f"worker {', '.join(map(str, lost))} (pid {child.pid}) ended with {end}"
         elif not charge_items:
-            reason = with_last_words(reason, last_words)
+            reason = with_last_words(reason, end.last_words)
         for number, worker in lost.items():
             self._ready.append(
                 WorkerLost(number, reason, charge_item=bool(worker.unanswered) and charge_items, traceback=traceback)
             )
-        return last_words
-
-
-def _end(child: _Child) -> tuple[str, str]:
-    """Kill a child; returns how it ended and its last output."""
-    _kill(child)
-    code = child.process.wait()
-    if child.guard is not None:
-        child.guard.communicate()
-    child.control.close()
-    child.log.seek(max(0, child.log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-    last_words = child.log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
-    child.log.close()
-    return f"signal {-code}" if code < 0 else f"exit code {code}", last_words
-
-
-def _kill(child: _Child) -> None:
-    """Kill a child and the processes that code of the user has started in it, which are in its process group."""
-    if child.process.returncode is None:  # it has not been waited for, so that the number is still its own
-        with suppress(ProcessLookupError):
-            os.killpg(child.process.pid, signal.SIGKILL)
-    child.process.kill()
-
-
-def _start_child(spec: bytes, undo: ExitStack, gpus: float, place: str) -> _Child:
-    """A new process that has been sent the constants of the run; closing `undo` ends it."""
-    undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
-    ours, theirs = _socket_pair()
-    undo.enter_context(ours)
-    with theirs:
-        process = start_child(
-            lambda: subprocess.Popen(
-                [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-                env=child_environment(gpus, place),
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                process_group=0,
-            )
-        )
-    undo.callback(process.wait)
-    undo.callback(process.kill)
-    guard = guard_of(process)
-    undo.callback(guard.communicate)
-    ours.sendall(spec)
-    ours.setblocking(False)  # if the child does not take its workers' sockets, they cannot be started
-    return _Child(process, log, ours, place, guard)
-
-
-def _socket_pair() -> tuple[socket.socket, socket.socket]:
-    """Pair of blocking sockets with large send buffers."""
-    pair = socket.socketpair()
-    for end in pair:
-        end.setblocking(True)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-    return pair
+        return end.last_words

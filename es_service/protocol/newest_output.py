@@ -13,6 +13,7 @@ import stat
 import threading
 import time
 from contextlib import suppress
+from functools import cache
 
 LOOK_S = 0.02
 """Longest time in seconds between two looks at the files; less while one of them grows fast."""
@@ -20,20 +21,18 @@ SHORTEST_S = 0.001
 
 
 class NewestOutput:
-    """Files that are cut to half a size before they exceed it, by a thread of this process.
+    """Files that are cut to half a size before they exceed it, by a thread that lives as long as there is one.
 
     A line that is written while a file is cut may be lost, or come before older ones.
     """
 
-    def __init__(self, most_bytes: int) -> None:
-        """Watch no file yet; the thread starts with the first one."""
-        self._most = most_bytes
-        self._sizes: dict[int, int] = {}
-        """Descriptors of our own -> bytes at the last look."""
-        self._turn, self._end = threading.Lock(), threading.Event()
-        self._thread: threading.Thread | None = None
+    def __init__(self) -> None:
+        """Watch no file yet."""
+        self._files: dict[int, tuple[int, int]] = {}
+        """Descriptors of our own -> (most bytes, bytes at the last look)."""
+        self._turn, self._thread, self._end = threading.Lock(), threading.Thread(), threading.Event()
 
-    def add(self, descriptor: int) -> int:
+    def add(self, descriptor: int, most_bytes: int) -> int:
         """Watch the file to which a descriptor leads; whoever has inherited this descriptor appends from now on.
 
         Returns the number for `forget`. Raises OSError if it leads to nothing that can be read and cut, such as a pipe.
@@ -45,40 +44,52 @@ class NewestOutput:
         watched = os.dup(descriptor) if is_readable else os.open(f"/proc/self/fd/{descriptor}", os.O_RDWR | os.O_APPEND)
         fcntl.fcntl(descriptor, fcntl.F_SETFL, flags | os.O_APPEND)
         with self._turn:
-            self._sizes[watched] = 0
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, daemon=True, name="keeps the newest output")
+            if not self._files:
+                self._end = threading.Event()
+                self._thread = threading.Thread(target=self._run, args=(self._end,), daemon=True, name="newest output")
                 self._thread.start()
+            self._files[watched] = most_bytes, 0
         return watched
 
     def forget(self, watched: int) -> None:
         """Leave a file as it is from now on."""
         with self._turn:
-            if self._sizes.pop(watched, None) is not None:
-                os.close(watched)
+            if self._files.pop(watched, None) is None:
+                return
+            os.close(watched)
+            if self._files:
+                return
+            self._end.set()
+            thread = self._thread
+        thread.join()
 
-    def close(self) -> None:
-        """Forget all files; the thread has ended."""
-        self._end.set()
-        if self._thread is not None:
-            self._thread.join()
-        for watched in list(self._sizes):
-            self.forget(watched)
-
-    def _run(self) -> None:
+    def _run(self, end: threading.Event) -> None:
         wait_s, looked_s = LOOK_S, time.monotonic()
-        while not self._end.wait(wait_s):
+        while not end.wait(wait_s):
             now, wait_s = time.monotonic(), LOOK_S
             with self._turn:
-                for watched, before in self._sizes.items():
+                if end.is_set():
+                    return
+                for watched, (most, before) in self._files.items():
                     size = os.fstat(watched).st_size
                     growth = (size - before) / (now - looked_s)
-                    if size > 3 * self._most // 4:
+                    if size > 3 * most // 4:
                         with suppress(OSError):  # such as a full disk
-                            size = cut(watched, self._most // 2)
-                    self._sizes[watched] = size
-                    wait_s = min(wait_s, (self._most - size) / 4 / max(growth, 1.0))
+                            size = cut(watched, most // 2)
+                    self._files[watched] = most, size
+                    wait_s = min(wait_s, (most - size) / 4 / max(growth, 1.0))
             looked_s, wait_s = now, max(wait_s, SHORTEST_S)
+
+
+def newest_output() -> NewestOutput:
+    """The files that this process watches."""
+    return _of(os.getpid())
+
+
+@cache
+def _of(process: int) -> NewestOutput:
+    """Those of a process; one that was forked has no thread that watches them."""
+    return NewestOutput()
 
 
 def cut(descriptor: int, most_bytes: int) -> int:

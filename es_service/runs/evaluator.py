@@ -26,10 +26,10 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.logs import logger
 from es_service.loop.checks import valid_members
 from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.child import require_same_process
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
-from es_service.protocol.parent import require_same_process
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 

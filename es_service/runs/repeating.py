@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.protocol.parent import answer_of
+from es_service.protocol.child import NoAnswerError, answer_of
+from es_service.protocol.raised import RaisedError
 from es_service.runs.view import Run
 from workers.environments import settings_of_description
 
@@ -26,13 +25,12 @@ def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str
         settings: see `settings_of_description`.
         seconds: duration of its measurement.
     """
-    command = [sys.executable, "-m", "workers.host.examine", name, json.dumps(settings), str(seconds)]
-    told = answer_of(command, LONGEST_S)
-    if told.content is not None:
-        return json.loads(told.content)
-    if told.code is None:
-        return {"problem": f"it could not be examined within {LONGEST_S:g} s"}
-    return {"problem": f"its process ended with exit code {told.code}:\n{told.errors[-2000:]}"}
+    try:
+        return answer_of("workers.host.examine", name, settings, request=(seconds,), limit_s=LONGEST_S)
+    except RaisedError as error:
+        return {"problem": error.message}
+    except NoAnswerError as error:
+        return {"problem": f"it could not be examined: its process {error}"}
 
 
 def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:

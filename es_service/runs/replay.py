@@ -8,9 +8,6 @@ is recorded, which shows neither its luck nor its bad luck.
 
 from __future__ import annotations
 
-import pickle
-import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -22,9 +19,10 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
+from es_service.protocol.child import NoAnswerError, answer_of
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import FloatArray
-from es_service.protocol.parent import answer_of
+from es_service.protocol.raised import RaisedError
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.certified import newest_certified
 from es_service.runs.checked_config import changed_config
@@ -100,7 +98,12 @@ def record(
         RecordRequest(centre_of(candidate.policy, candidate.generation), config.seed) if its is None else its.request
         for candidate, its in zip(chosen, stored, strict=True)
     ]
-    recorded = _answer((worker_spec(config, task_of(config)), requests))
+    task, spec = config.task.environment, worker_spec(config, task_of(config))
+    try:
+        recorded = answer_of("workers.recording", task, spec, request=(requests,), limit_s=RECORD_S)
+    except (NoAnswerError, RaisedError) as error:
+        why = f"their process {error}" if isinstance(error, NoAnswerError) else error
+        raise EvaluationError(f"episodes could not be recorded: {why}") from None
     return [Replay(*parts) for parts in zip(chosen, recorded.recordings, stored, strict=True)], recorded
 
 
@@ -143,16 +146,3 @@ def _stored(run: Run, candidate: Candidate, now: Mapping[str, Any]) -> StoredEpi
         changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
     request = RecordRequest(centre_of(candidate.policy, candidate.generation), **vars(resets))
     return StoredEpisode(request, row["fitness_first"], candidate.trace_T_B, tuple(changes))
-
-
-def _answer(question: tuple) -> Recordings:
-    with tempfile.NamedTemporaryFile() as requests:
-        requests.write(pickle.dumps(question))
-        requests.flush()
-        told = answer_of([sys.executable, "-m", "workers.recording", requests.name], RECORD_S)
-    if told.content is not None:
-        return pickle.loads(told.content)
-    if told.code is None:
-        raise EvaluationError(f"episodes could not be recorded within {RECORD_S:g} s; choose fewer")
-    last = (told.errors.splitlines() or ["it printed nothing"])[-1]
-    raise EvaluationError(f"episodes could not be recorded: {last}")

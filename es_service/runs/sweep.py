@@ -23,7 +23,7 @@ from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreErr
 from es_service.logs import logger
 from es_service.loop.budget import limits_of
 from es_service.loop.history import Row
-from es_service.protocol.parent import require_same_process
+from es_service.protocol.child import require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.system import given_path
 from es_service.runs.folders import INSIDE, write_groups

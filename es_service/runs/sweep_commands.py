@@ -13,7 +13,7 @@ from es_service.config.model import RunConfig
 from es_service.errors import StoreError
 from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
-from es_service.protocol.parent import bound
+from es_service.protocol.child import bound
 from es_service.runs.certified import certified_over_time, target_reached
 from es_service.runs.run_status import recent_durations
 from es_service.runs.sweep_plan import PlannedRun

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.protocol.child import require_same_process
 from es_service.protocol.content import names_in
-from es_service.protocol.parent import require_same_process
 from es_service.store import certifications
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -13,36 +11,35 @@ import pytest
 
 from es_service.cli import bench_rollouts
 from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol.child import Child
 
-FAILS, HANGS = "raise SystemExit('no such task')", "import time; time.sleep(60)"
+FAILS, HANGS = "tests.es_service.shell_child", "tests.es_service.test_system"
+"""Modules: the first refuses what `workers.measure` is asked, the second sleeps."""
 
 
 def interrupt(number, frame):
     raise Interrupted(number)
 
 
-@pytest.mark.parametrize("programs", [(FAILS, HANGS), (HANGS, HANGS)])
-def test_nobody_goes_on_measuring_after_a_failure_or_a_signal(monkeypatch, programs):
+@pytest.mark.parametrize("modules", [(FAILS, HANGS), (HANGS, HANGS)])
+def test_nobody_goes_on_measuring_after_a_failure_or_a_signal(monkeypatch, modules):
     """Of two processes one fails, or the command is told to stop."""
-    popen, started = subprocess.Popen, []
+    started: list[Child] = []
 
-    def start(command, **options):
-        started.append(popen([sys.executable, "-c", programs[len(started)]], **options))
+    def start(module, environment):
+        started.append(Child(modules[len(started)], environment))
         return started[-1]
 
-    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(bench_rollouts, "Child", start)
     before = signal.signal(signal.SIGTERM, interrupt)
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM))
-    if FAILS not in programs:
+    if FAILS not in modules:
         timer.start()
     began = time.monotonic()
     try:
         with pytest.raises((EvaluationError, Interrupted)):
             bench_rollouts._row({"task": "point_maze"}, 2)
-        assert [process.poll() is None for process in started] == [False, False]
+        assert [child.is_ended for child in started] == [True, True]
         assert time.monotonic() - began < 30
     finally:
         signal.signal(signal.SIGTERM, before)
-        for process in started:
-            process.kill()
-            process.communicate()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import random
 import re
 import signal
 import socket
-import subprocess
-import tempfile
 import threading
 import time
 from contextlib import ExitStack
@@ -24,13 +21,16 @@ from es_service.dispatch.events import Limits, Placed, Progress, WorkerLost, Wor
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import kept_subjects
+from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_subjects import KEPT_SUBJECTS, forget_old_subjects
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
+from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 
+SHELL = "tests.es_service.shell_child"
 FIRST = centre(random_parameters(0))
 CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(2)]
 
@@ -38,31 +38,17 @@ CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(2)]
 @pytest.fixture
 def transport():
     """Two workers, threads of one child that does nothing, and the ends that should be theirs: in the test's hands."""
-    with tempfile.TemporaryFile() as log, ExitStack() as stack:
-        process = subprocess.Popen(["sleep", "60"], stdout=log, stderr=log)
-        child = inline_module._Child(process, log, stack.enter_context(socket.socket()))
+    with ExitStack() as stack:
+        child = Child(SHELL, child_environment())
         transport = inline_module.ChildProcesses(SPEC, threads=True)
         ends = []
         for worker in range(2):
-            ours, theirs = inline_module._socket_pair()
+            ours, theirs = socket_pair()
             ends.append(stack.enter_context(theirs))
             transport._add(worker, child, ours)
         yield transport, ends
         transport.close()
-        assert process.wait() == -signal.SIGKILL
-
-
-def test_of_a_child_that_wrote_a_lot_only_the_end_is_read():
-    """More than fits into memory: a hole in the file, which takes no room on the disk either."""
-    with tempfile.TemporaryFile() as log, socket.socket() as control:
-        log.truncate(2**40)
-        process = subprocess.Popen(["sleep", "60"])
-        log.seek(0, os.SEEK_END)
-        log.write("ä".encode() * 1500 + b" the last words\n")
-        how, last_words = inline_module._end(inline_module._Child(process, log, control))
-    assert how == "signal 9"
-    assert last_words.endswith("ää the last words")
-    assert 990 < len(last_words) <= 2000
+        assert child.end().how == "signal SIGKILL"
 
 
 class Receiver:
@@ -239,7 +225,7 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
 
 def test_what_a_process_wrote_before_it_was_killed_is_told_of_all_its_workers(transport):
     transport, _ = transport
-    transport._workers[0].child.log.write(b"waiting for a licence\n")
+    transport._workers[0].child._log.write(b"waiting for a licence\n")
     assert transport.kill(0) == "waiting for a licence"
     lost = transport.receive(0.0)
     assert isinstance(lost, WorkerLost)

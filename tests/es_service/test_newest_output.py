@@ -30,14 +30,14 @@ os.kill(os.getpid(), 9)
 def test_of_what_a_process_and_its_children_write_the_newest_is_there_after_a_kill():
     before = threading.active_count(), len(os.listdir("/proc/self/fd"))
     with tempfile.TemporaryFile() as file:
-        output = NewestOutput(MOST)
-        output.add(file.fileno())
+        output = NewestOutput()
+        watched = output.add(file.fileno(), MOST)
         process = subprocess.Popen([sys.executable, "-c", LOUD], stdout=file, stderr=file)
         sizes = []
         while process.poll() is None:
             sizes.append(os.fstat(file.fileno()).st_size)
             time.sleep(0.001)
-        output.close()
+        output.forget(watched)
         assert process.returncode == -signal.SIGKILL
         assert max(sizes) < 1_500_000, "of more than 3 MB"
         file.seek(0)
@@ -48,10 +48,10 @@ def test_of_what_a_process_and_its_children_write_the_newest_is_there_after_a_ki
 
 
 def test_a_file_that_is_forgotten_stays_as_it_is():
-    output = NewestOutput(1000)
+    output = NewestOutput()
     with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as other:
-        watched = output.add(file.fileno())
-        output.add(other.fileno())
+        watched = output.add(file.fileno(), 1000)
+        last = output.add(other.fileno(), 1000)
         output.forget(watched)
         for one in (file, other):
             os.write(one.fileno(), b"x" * 5000)
@@ -59,13 +59,13 @@ def test_a_file_that_is_forgotten_stays_as_it_is():
         while os.fstat(other.fileno()).st_size != 500 and time.monotonic() < until:  # 0 in the middle of a cut
             time.sleep(0.01)
         assert [os.fstat(one.fileno()).st_size for one in (file, other)] == [5000, 500]
-        output.close()
+        output.forget(last)
         output.forget(watched)
 
 
 def test_a_pipe_is_refused():
     ends = os.pipe()
     with pytest.raises(OSError, match="no regular file"):
-        NewestOutput(1000).add(ends[1])
+        NewestOutput().add(ends[1], 1000)
     for end in ends:
         os.close(end)

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import pickle
 import random
-import socket
-import subprocess
-import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -27,8 +24,10 @@ from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE
 from es_service.errors import EvaluationError
 from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import Work
 from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
 from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import spec
@@ -87,9 +86,8 @@ class Threads(inline_module.ChildProcesses):
         """Names of the parents that were sent with each work item."""
 
     def start(self, worker: int) -> None:
-        log, control = tempfile.TemporaryFile(), socket.socket()  # noqa: SIM115
-        child = inline_module._Child(subprocess.Popen(["sleep", "60"]), log, control)
-        ours, theirs = inline_module._socket_pair()
+        child = Child("tests.es_service.shell_child", child_environment())
+        ours, theirs = socket_pair()
         computing: Future[Any] = Future()
         computing.set_result(COMPUTING)
         given = theirs.detach(), computing, self.theirs

@@ -17,9 +17,9 @@ ROOT = Path(__file__).parents[2]
 MISSING = ROOT / "tests" / "without_linux"
 PARENT = """
 import subprocess, sys, time
-from es_service.protocol import parent
-child = subprocess.Popen(parent.bound("tests.es_service.test_system"))
-print(child.pid, flush=True)
+from es_service.protocol import child
+process = subprocess.Popen(child.bound("tests.es_service.test_system"))
+print(process.pid, flush=True)
 time.sleep(60)
 """
 if __name__ == "__main__":

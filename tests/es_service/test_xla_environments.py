@@ -17,8 +17,8 @@ import pytest
 
 from es_service.environments.single import TaskEnv
 from es_service.environments.vector import TaskVectorEnv
+from es_service.protocol.child import NoAnswerError
 from tests.es_service.test_environments import actions_of, same
-from workers.child import LostProcessError
 from workers.environments import TaskError
 
 DRAWN, TRANSFORMED_START = "tests.es_service.xla_tasks:Drawn", "tests.es_service.xla_tasks:TransformedStart"
@@ -91,7 +91,7 @@ def test_a_lost_process_is_an_error():
     with quietly(DRAWN, 2) as envs:
         envs.reset(seed=0)
         os.kill(envs._lanes._blocks._children[0]._process.pid, signal.SIGKILL)
-        with pytest.raises(LostProcessError, match=r"xla computes .*Drawn has ended with signal SIGKILL; make"):
+        with pytest.raises(NoAnswerError, match=r"xla computes .*Drawn ended with signal SIGKILL; make"):
             envs.step(np.zeros((2, 3)))
 
 
@@ -105,7 +105,7 @@ def test_after_an_interrupted_step_no_answer_is_that_of_another_call():
         with pytest.raises(KeyboardInterrupt):
             envs.step(np.zeros((20, 3)))
         for call in (lambda: envs.step(np.zeros((20, 3))), envs.get_state, envs.reset):
-            with pytest.raises(LostProcessError, match="make the environments anew"):
+            with pytest.raises(NoAnswerError, match="make the environments anew"):
                 call()
 
 

@@ -15,10 +15,8 @@ from tests.system.session import SMALL
 UNPICKLERS = {
     "es_service.protocol.wire": "messages between the driver and its own child processes",
     "es_service.dispatch.ray_engine": "answers of the workers in the cluster",
-    "es_service.runs.replay": "the answer of its own child process, in a new folder of its own",
     "es_service.runs.scaling": "what it pickled itself, to measure how long it takes",
     "workers.actor": "messages of the driver",
-    "workers.recording": "the request of the process that started it",
 }
 """Module that unpickles -> what; each has it from a process of ours or from the cluster, and none from a run folder."""
 PICKLERS = {
@@ -79,7 +77,7 @@ def test_data_do_not_become_code(path):
         ("es_service.report.data", "from shelve import open", "imports shelve"),
         ("es_service.runs.view", "import joblib.externals", "imports joblib"),
         ("es_service.runs.export", "pickle.load(stream)", "calls pickle.load"),
-        ("es_service.runs.replay", "from pickle import loads", "hides whose names"),
+        ("es_service.runs.scaling", "from pickle import loads", "hides whose names"),
         ("es_service.store.codec", "np.load(file, allow_pickle=True)", "allows NumPy"),
         ("es_service.store.codec", "np.load(file, allow_pickle=chosen)", "allows NumPy"),
         ("es_service.runs.view", "pd.read_pickle(file)", "calls pd.read_pickle"),

@@ -245,7 +245,10 @@ def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(ki
     config["task"]["time_limit_s"] = {"hang": 1.0, "exit": 5.0}[kind]  # another one has another process, too
     notices: list[str] = []
     run = api.run(config, tmp_path / "run", on_notice=notices.append).run
-    why = {"hang": r"no result within 1 s \(task.time_limit_s\)", "exit": "the call ended its process with exit code 3"}
+    why = {
+        "hang": r"its process gave no answer within 1 s \(task.time_limit_s\)",
+        "exit": "its process ended with exit code 3",
+    }
     assert re.search(rf"member [+-] of pair \d with x0 = .*, x2 = \S+ \(seed \d+\): {why[kind]}", *notices)
     assert run.history[["lost_workers", "retries"]].to_numpy().sum() == 0
     assert run.history.invalid_members.sum() == 1
@@ -392,7 +395,7 @@ def test_a_call_in_a_process_of_its_own_imports_what_its_worker_can(tmp_path, mo
 def test_a_process_that_cannot_be_started_once_is_started_by_the_next_call(monkeypatch):
     caller = Caller(HILL, {}, 20.0)
     with monkeypatch.context() as patch:
-        patch.setattr("workers.child.start_child", lambda start: (_ for _ in ()).throw(BlockingIOError()))
+        patch.setattr("es_service.protocol.child.start_child", lambda start: (_ for _ in ()).throw(BlockingIOError()))
         with pytest.raises(BlockingIOError):
             caller(np.zeros(3, np.float32), 0)
     assert np.isfinite(caller(np.zeros(3, np.float32), 0)[0])

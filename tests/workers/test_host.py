@@ -120,7 +120,7 @@ def test_of_what_a_simulator_prints_the_newest_is_kept_and_told_when_its_worker_
     with inline_engine(loud, Limits(workers=1)) as engine:
         for chunk in range(4):
             engine.evaluate([(subject, TrainingChunk(1, chunk))])
-        log = engine.transport._workers[0].child.log.fileno()
+        log = engine.transport._workers[0].child._log.fileno()
         while os.fstat(log).st_size > 75_000:
             assert time.monotonic() < patience_s, "8 MB were printed"
             time.sleep(0.02)

@@ -10,11 +10,11 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from es_service.protocol.child import Child, NoAnswerError, answer_parent
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.options import OptionValue
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.raised import RaisedError
-from workers.child import Child, LostProcessError, answer_parent
 from workers.environments import make_function_task
 from workers.environments.function_task import FunctionTask
 
@@ -42,41 +42,33 @@ class Caller:
 
     def start(self) -> None:
         """Start the process if there is none. Raises CallFailedError if the function cannot be imported there."""
-        if self._child is None:
-            self._child = Child("workers.host.caller", os.environ | same_imports())
-            self._child.ask(*self._given)
-            try:
-                self._answer(START_S, f"its process did not start within {START_S:g} s")
-            except CallFailedError:
-                self.close()
-                raise
+        if self._child is not None and not self._child.is_ended:
+            return
+        self._child = Child("workers.host.caller", os.environ | same_imports(), None)
+        try:
+            self._answer(self._given, START_S)
+        except CallFailedError:
+            self.close()
+            raise
 
     def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
         """(fitness, descriptor [B]). Raises CallFailedError if the call raised, ended its process, or took too long."""
         self.start()
-        assert self._child is not None, "it has been started"
-        self._child.ask(parameters_D, seed)
-        return self._answer(self._limit_s, f"no result within {self._limit_s:g} s (task.time_limit_s)")
+        return self._answer((parameters_D, seed), self._limit_s, " (task.time_limit_s)")
 
     def close(self) -> None:
         """End the process, and those that it has started."""
         if self._child is not None:
-            self._child.close()
-            self._child = None
+            self._child.end()
 
-    def _answer(self, limit_s: float, late: str) -> Any:
+    def _answer(self, request: tuple[Any, ...], limit_s: float, key: str = "") -> Any:
         assert self._child is not None, "the process has been started"
         try:
-            answer = self._child.answer(limit_s)
-        except BaseException as error:
-            self._child = None
-            if isinstance(error, TimeoutError | LostProcessError):
-                why = late if isinstance(error, TimeoutError) else f"the call ended its process with {error}"
-                raise CallFailedError(why) from None
-            raise
-        if isinstance(answer, RaisedError):
-            raise CallFailedError(answer.message)
-        return answer
+            return self._child.call(*request, limit_s=limit_s)
+        except NoAnswerError as error:
+            raise CallFailedError(f"its process {error}{key if error.is_late else ''}") from None
+        except RaisedError as error:
+            raise CallFailedError(error.message) from None
 
 
 if __name__ == "__main__":

@@ -1,16 +1,13 @@
 """Try a task: whether its numbers are finite, and one of Python objects or a function whether it repeats and how fast.
 
-    python -m workers.host.examine NAME SETTINGS SECONDS ANSWER
+    python -m workers.host.examine DESCRIPTOR     # run by `es_service.protocol.child`
 
-NAME and SETTINGS are what `workers.describe` takes; SECONDS is how long to measure.
-Writes JSON to the file ANSWER: {"problem": text}, or the fields of `Examined`. `es-service doctor TASK` runs it in two
-processes and compares their hashes.
+`es-service doctor TASK` runs it in two processes and compares their hashes.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -20,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from es_service.protocol.child import answer_parent
 from es_service.protocol.messages import HostChoices, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
-from es_service.protocol.parent import end_soon, write_answer
-from es_service.protocol.raised import raised
 from es_service.protocol.rollouts import choose
 from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
-from workers.environments import TaskError, choices_of, make_function_task, make_host_task
+from workers.environments import choices_of, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment
 from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
@@ -170,20 +166,12 @@ def _hash(said: list[Any]) -> str:
     return hasher.hexdigest()
 
 
-def main(name: str, settings: str, seconds: str, file: str) -> None:
-    """Write the findings about a task, or its problem, as JSON to a file."""
-    try:
-        given = json.loads(settings)
-        task = described(name, given)
-        options = option_values(task.options, given.get("options", {}))
-        answer: dict[str, Any] = asdict(examine(task, options, choices_of(given), float(seconds)))
-    except TaskError as error:
-        answer = {"problem": str(error)}
-    except Exception as error:  # the user's code can raise anything
-        answer = {"problem": raised(error, name).message}
-    write_answer(file, json.dumps(answer).encode())
+def examiner(name: str, settings: Mapping[str, Any]) -> Callable[[float], dict[str, Any]]:
+    """Function from the seconds to measure to the fields of `Examined`; see `workers.describe` for the arguments."""
+    task = described(name, settings)
+    options = option_values(task.options, settings.get("options", {}))
+    return lambda seconds: asdict(examine(task, options, choices_of(settings), seconds))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
-    end_soon()
+    answer_parent(int(sys.argv[1]), examiner)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import select
-import signal
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from copy import copy
 
 import numpy as np
@@ -22,35 +18,7 @@ STEPS = 60
 """Most steps of an episode that is tried."""
 LONGEST_S = 0.5
 """Time after which a trial does no further step, so that a slow simulator is described soon."""
-APART_S = 20.0
-"""Longest time of a whole trial in a process of its own."""
 SEED, OTHER_SEED = 1, 2
-
-
-def tried_apart(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices) -> str:
-    """`does_not_repeat` in a copy of this process, which a simulator may end or make wait; empty if nothing was found.
-
-    For a process with one thread. Whatever the simulator prints goes to stderr.
-    """
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setsid()  # so that processes that the simulator starts end with it
-            os.dup2(2, 1)
-            os.write(write, does_not_repeat(task, options, choices).encode())
-        finally:
-            os._exit(0)
-    os.close(write)
-    try:
-        ready, _, _ = select.select([read], [], [], APART_S)
-        return os.read(read, 1000).decode() if ready else ""
-    finally:
-        os.close(read)
-        with suppress(ProcessLookupError):  # it may not have begun its session yet, so both
-            os.killpg(child, signal.SIGKILL)
-        os.kill(child, signal.SIGKILL)  # it has not been waited for, so that the number is its own
-        os.waitpid(child, 0)
 
 
 def does_not_repeat(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices = NO_CHOICES) -> str:

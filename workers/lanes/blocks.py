@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.child import Child, NoAnswerError
 from es_service.protocol.options import OptionValue
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError
-from workers.child import Child, LostProcessError
 from workers.environments import TaskError
 from workers.lanes.functions import Seen
 from workers.xla_cache import xla_cache_settings
@@ -53,7 +53,7 @@ class Blocks:
         try:
             requests = []
             for start, end in pairwise(bounds):
-                self._children.append(Child("workers.lanes.process", environment))
+                self._children.append(Child("workers.lanes.process", environment, None))
                 requests.append((self._children[-1], (name, dict(options), end - start, first if start == 0 else 0)))
             self._answers(requests)
         except BaseException:
@@ -84,7 +84,7 @@ class Blocks:
     def close(self) -> None:
         """End the processes."""
         for child in self._children:
-            child.close()
+            child.end()
 
     def _shared(self, kind: str, lane_M: NDArray[np.intp], given_M: NDArray) -> list[Any]:
         """Answers of the processes that have some of the lanes."""
@@ -97,22 +97,19 @@ class Blocks:
 
     def _answers(self, requests: Sequence[tuple[Child, tuple[Any, ...]]]) -> list[Any]:
         """Answers of processes to one request each. Raises TaskError with what the task's code raised, or
-        LostProcessError; after that, and after an interruption, the processes have ended."""
+        NoAnswerError; the processes have ended then, and after an interruption."""
         try:
             for child, request in requests:
                 child.ask(*request)
-            answers = [child.answer() for child, _ in requests]
+            return [child.answer() for child, _ in requests]
         except BaseException as error:
             self.close()
-            if not isinstance(error, LostProcessError):
-                raise
-            raise LostProcessError(
-                f"the process in which xla computes {self._name} has ended with {error}; make the environments anew"
-            ) from None
-        for answer in answers:
-            if isinstance(answer, RaisedError):
-                raise TaskError(answer.message)
-        return answers
+            if isinstance(error, RaisedError):
+                raise TaskError(error.message) from None
+            if isinstance(error, NoAnswerError):
+                what = f"the process in which xla computes {self._name} {error}"
+                raise NoAnswerError(f"{what}; make the environments anew") from None
+            raise
 
 
 def _joined(answers: list[Any]) -> Any:

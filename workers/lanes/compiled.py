@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.child import require_same_process
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
-from es_service.protocol.parent import require_same_process
 from workers.environments import TaskError, make_environment
 from workers.lanes.blocks import Blocks
 from workers.lanes.functions import Seen, lane_functions

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.child import answer_parent
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
-from workers.child import answer_parent
 from workers.environments import make_environment
 from workers.lanes.blocks import BLOCK
 from workers.lanes.functions import Seen, lane_functions

@@ -13,7 +13,7 @@ import json
 import sys
 from pathlib import Path
 
-from es_service.protocol.parent import end_with
+from es_service.protocol.child import end_with
 from tests.benchmarks.baselines.programs import SYSTEMS
 from tests.benchmarks.baselines.run import Run
 

@@ -1,10 +1,9 @@
-"""Child processes that answer one question, and tasks of users that start runs in them."""
+"""Child processes that answer requests, and tasks of users that start runs in them."""
 
 from __future__ import annotations
 
 import importlib
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -12,9 +11,11 @@ import pytest
 
 from es_service.config.tasks import TASKS
 from es_service.errors import TaskError
-from es_service.protocol.parent import answer_of
+from es_service.protocol.child import Child, NoAnswerError, answer_of
 from es_service.protocol.process_environment import DEPTH, MOST_DEPTH, child_environment, require_no_import_of_a_task
+from es_service.protocol.raised import RaisedError
 
+SHELL = "tests.es_service.shell_child"
 LONG_S = 60.0
 """Longer than any of these tests may take."""
 DESCRIBED = """
@@ -29,11 +30,6 @@ es_service.run(
 """
 
 
-def shell(program: str) -> list[str]:
-    """A child that is a shell, whose $0 is the file for the answer."""
-    return ["/bin/sh", "-c", program]
-
-
 def is_running(pid: int) -> bool:
     status = Path(f"/proc/{pid}/stat")
     return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
@@ -42,8 +38,8 @@ def is_running(pid: int) -> bool:
 def test_a_process_that_a_simulator_leaves_delays_no_answer_and_is_ended(tmp_path):
     """It holds the child's stdout and stderr open, as a server does that a simulator starts."""
     begun_s = time.monotonic()
-    told = answer_of(shell(f"sleep 99 & echo $! > {tmp_path}/pid; echo noise; echo words >&2; printf 3 > $0"), LONG_S)
-    assert (told.content, told.code, told.errors) == (b"3", 0, "words")
+    program = f"sleep 99 & echo $! > {tmp_path}/pid; echo words; echo noise >&2; exit 3"
+    assert answer_of(SHELL, "ends", request=(program,), limit_s=LONG_S) == 3
     assert time.monotonic() - begun_s < LONG_S / 2
     left = int((tmp_path / "pid").read_text())
     while is_running(left):  # it has been killed, and its new parent may take a moment to see that
@@ -51,26 +47,40 @@ def test_a_process_that_a_simulator_leaves_delays_no_answer_and_is_ended(tmp_pat
         time.sleep(0.001)
 
 
-def test_an_answer_counts_however_the_child_ends():
-    told = answer_of(shell("printf 3 > $0; echo crashed >&2; kill -SEGV $$"), LONG_S)
-    assert (told.content, told.errors) == (b"3", "crashed")
-    told = answer_of(shell("echo why >&2; exit 4"), LONG_S)
-    assert (told.content, told.code, told.errors) == (None, 4, "why")
-    told = answer_of(shell("exec sleep 99"), 0.01)
-    assert (told.content, told.code) == (None, None)
+def test_the_end_of_a_child_is_a_sentence_with_the_last_that_it_printed(tmp_path):
+    with pytest.raises(NoAnswerError) as ended:
+        answer_of(SHELL, "ends", request=("echo no licence; kill -SEGV $PPID",), limit_s=LONG_S)
+    assert (str(ended.value), ended.value.is_late) == ("ended with signal SIGSEGV:\nno licence", False)
+    with Child(SHELL, child_environment()) as child:
+        child.call("ends", limit_s=LONG_S)
+        child.ask(f"echo waits for a licence; touch {tmp_path}/begun; sleep 99")
+        until_s = time.monotonic() + LONG_S
+        while not (tmp_path / "begun").exists() and time.monotonic() < until_s:
+            time.sleep(0.001)
+        with pytest.raises(NoAnswerError) as late:
+            child.answer(0.01)
+        assert child.is_ended
+    assert (str(late.value), late.value.is_late) == ("gave no answer within 0.01 s:\nwaits for a licence", True)
+    with pytest.raises(RaisedError, match="cannot be imported"):
+        answer_of(SHELL, "raises", limit_s=LONG_S)
 
 
-def test_a_thread_that_does_not_end_delays_no_answer():
-    lines = (
-        "import sys, threading",
-        "from es_service.protocol import parent",
-        "threading.Thread(target=threading.Event().wait).start()",
-        "parent.write_answer(sys.argv[1], b'3')",
-        "parent.END_S = 0.01",
-        "parent.end_soon()",
-    )
-    told = answer_of([sys.executable, "-c", "\n".join(lines)], LONG_S)
-    assert (told.content, told.code) == (b"3", 0)
+def test_a_thread_that_does_not_end_delays_no_answer(monkeypatch):
+    monkeypatch.setattr("es_service.protocol.child.END_S", 0.01)
+    assert answer_of(SHELL, "waits", request=("exit 3",), limit_s=LONG_S) == 3
+
+
+def test_of_a_child_that_printed_a_lot_only_the_end_is_read():
+    """More than fits into memory: a hole in the file, which takes no room on the disk either."""
+    child = Child(SHELL, child_environment())
+    assert child._log is not None
+    child._log.truncate(2**40)
+    child._log.seek(0, os.SEEK_END)
+    child._log.write("ä".encode() * 1500 + b" the last words\n")
+    how, last_words = child.end()
+    assert how == "signal SIGKILL"
+    assert last_words.endswith("ää the last words")
+    assert 990 < len(last_words) <= 2000
 
 
 @pytest.mark.parametrize("program", [DESCRIBED, RUN])
