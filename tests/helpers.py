@@ -136,8 +136,7 @@ def inline_here(
 def workers_in_this_process() -> Iterator[None]:
     """Inside the block neither the engine inline nor a recording of episodes starts a process."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("session", "evaluation", "verification"):
-            patch.setattr(f"es_service.runs.{module}.inline_engine", inline_here)
+        patch.setattr("es_service.runs.engine.inline_engine", inline_here)
         patch.setattr(
             "es_service.runs.replay.answer_of", lambda _, *given, request, limit_s: recorder(*given)(*request)
         )

@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
@@ -37,7 +36,8 @@ from es_service.runs.certified import (
     resets_of,
     stored,
 )
-from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
+from es_service.runs.engine import engine_here
+from es_service.runs.evaluation import Candidate, candidates, evaluation_config
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import code_of
 from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
@@ -291,7 +291,7 @@ def workers_for(
     outputs = outputs_of(task)
     if compared and task.parameters is None:
         outputs = (*outputs, FIRST_OBSERVATION)
-    return workers_of(config, replace(worker_spec(config, task, outputs), keyed_resets=compared), None, on_compile)
+    return engine_here(config, on_compile, outputs=outputs, keyed_resets=compared)
 
 
 def outputs_of(task: TaskSpec) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ same ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from math import sqrt
 
@@ -17,18 +16,13 @@ from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.config.workload import worker_spec
-from es_service.dispatch.dispatch_log import no_log
-from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.arrays import BEST, CENTRES, OBSERVATIONS
 from es_service.loop.generation import evaluate_centres
 from es_service.protocol.evaluator import Evaluator, completed
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments, WorkerSpec
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments
 from es_service.runs.checked_config import changed_config
-from es_service.runs.compiling import compiling_sentence, noting
-from es_service.runs.session import dispatch_limits
-from es_service.runs.signals import stop_on_signals
+from es_service.runs.engine import engine_here
 from es_service.runs.snapshot import Policy, Snapshot, make_policy
 from es_service.runs.view import Run, named_best
 from es_service.runs.worker_count import on_this_machine, require_cores
@@ -193,8 +187,8 @@ def evaluate(
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     task = task_of(config)
-    spec = worker_spec(config, task, ("success",) if task.success else ())
-    with workers_of(config, spec, chunks * len(chosen), on_compile) as engine:
+    outputs = ("success",) if task.success else ()
+    with engine_here(config, on_compile, at_once=chunks * len(chosen), outputs=outputs) as engine:
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
@@ -206,35 +200,6 @@ def evaluate(
                 if geometry is not None and np.isfinite(descriptors.mean_O).all():
                     cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
                 yield Fresh(candidate, fitness, descriptors, successes if task.success else None, cell)
-
-
-@contextmanager
-def workers_of(
-    config: RunConfig, spec: WorkerSpec, chunks: int | None, on_compile: Callable[[str], None]
-) -> Iterator[Evaluator]:
-    """Workers on this machine, until the end of the block or a signal.
-
-    Args:
-        chunks: number of chunks that can be computed at the same time; None: as in a generation of a run.
-        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
-    """
-
-    def tell_compiling(kind: str, text: str) -> None:
-        if sentence := compiling_sentence(spec, kind, text, here=True):
-            on_compile(sentence)
-
-    with (
-        stop_on_signals() as should_stop,
-        inline_engine(
-            spec,
-            dispatch_limits(config, chunks),
-            should_stop,
-            gpus=config.compute.worker_resources.gpu,
-            log=noting(no_log, spec),
-            on_compile=tell_compiling,
-        ) as engine,
-    ):
-        yield engine
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness

@@ -31,7 +31,8 @@ from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.checked_config import changed_config, load_config
-from es_service.runs.session import initial_policy, make_engine
+from es_service.runs.engine import make_engine
+from es_service.runs.session import initial_policy
 
 _LOG = logger(__name__)
 LARGEST = 2**63 - 1

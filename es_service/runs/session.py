@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from es_service.config.model import MapConfig, RunConfig
 from es_service.config.rules import placing_seconds
 from es_service.config.tasks import task_of
-from es_service.config.workload import parallel_sentence, policy_spec, worker_spec
-from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_log
-from es_service.dispatch.engine import Engine
-from es_service.dispatch.events import Limits
-from es_service.dispatch.inline_engine import inline_engine
+from es_service.config.workload import parallel_sentence, policy_spec
+from es_service.dispatch.dispatch_log import Committed, dispatch_log
 from es_service.errors import Action, EvaluationError, Interrupted, ServiceError, StoreError, WayOut, counted
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
@@ -25,31 +20,23 @@ from es_service.loop.history import evaluated_word
 from es_service.protocol.evaluator import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
-from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
-from es_service.protocol.process_environment import require_no_import_of_a_task
-from es_service.runs.compiling import compiling_sentence, noting
+from es_service.runs.engine import make_engine
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.strangers import require_sound_state
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import patient_store
-from es_service.runs.worker_count import work_at_once, worker_count
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.lock import RunLock
 from es_service.store.writer import RunStore
-from workers.actor import WorkerActor
-from workers.host.described import described
 from workers.policies.policy import initial_parameters
-from workers.rollouts import BACKENDS
 
 _LOG = logger(__name__)
 LONG_PLACING_S = 2.0
 """Time from which on it is said that centroids are placed."""
-CALLS_S = 60.0
-"""Seconds in which the process of a function can be replaced, beside the time of its calls."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
 """Called with each history row after its generation is committed, or has begun to wait for that (`runs/waiting.py`). A
 `Stop` that it returns ends the session."""
@@ -114,8 +101,7 @@ def work(
         waits = f"no worker has a place in the cluster; the run waits {until}. {shortage}"
         tell(waits if shortage else "a worker has a place in the cluster; the run begins")
 
-    def tell_compiling(kind: str, text: str) -> None:
-        sentence = compiling_sentence(spec, kind, text, here=config.compute.address is None)
+    def tell_compiling(sentence: str) -> None:
         store.lock.say(doing=sentence)
         if sentence:
             _LOG.info(sentence)
@@ -145,7 +131,7 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, spec = config.compute, worker_spec(config, task, asks_caller=asks_caller)
+    compute = config.compute
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     with (
@@ -155,9 +141,7 @@ def work(
         nullcontext(lambda: None) if asks_caller else stop_on_signals() as should_stop,
         nullcontext()
         if asks_caller
-        else make_engine(
-            config, should_stop, noting(log, spec) if compute.address is None else log, tell_wait, tell, tell_compiling
-        ) as engine,
+        else make_engine(config, should_stop, log, tell_wait, tell, tell_compiling) as engine,
     ):
 
         def tell_failed(failures: Sequence[str]) -> None:
@@ -250,82 +234,6 @@ def _naming_the_run(store: RunStore, action: Action) -> Iterator[None]:
         ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
         error.run, error.ways_out = run, (*ways_out, resume)
         raise
-
-
-def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
-    """The engine's number of workers and time limits."""
-    compute, task = config.compute, task_of(config)
-    rollout = BACKENDS[compute.rollout]
-    limit_s = config.task.time_limit_s  # that of the environments of a chunk, which step side by side
-    if limit_s is not None and task.kind == "function":  # enough for its calls, which end by themselves
-        limit_s = 2 * compute.chunk_pairs * config.task.episodes_per_member * limit_s + CALLS_S
-    return Limits(
-        workers=worker_count(config, most),
-        max_attempts=compute.max_attempts,
-        start_timeout_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
-        compile_timeout_s=compute.compile_timeout_s,
-        first_chunk_timeout_s=compute.first_chunk_timeout_s,
-        chunk_timeout_s=compute.chunk_timeout_s,
-        place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
-        no_worker_timeout_s=compute.no_worker_timeout_s,
-        items_overlap=not rollout.runs_in_threads,
-        late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
-        time_limit_s=limit_s,
-        episodes_together=rollout.episodes_together(task),
-        policies_together=POLICIES_TOGETHER if rollout.takes_chunks_together else POLICY_SLOTS,
-    )
-
-
-def make_engine(
-    config: RunConfig,
-    should_stop: Callable[[], int | None] = lambda: None,
-    log: Log = no_log,
-    on_wait: Callable[[str], None] = lambda shortage: None,
-    on_refusal: OnNotice = lambda refusal: None,
-    on_compile: Callable[[str, str], None] = lambda kind, text: None,
-    *,
-    at_once: int | None = None,
-    outputs: tuple[str, ...] = (),
-) -> Engine[Any]:
-    """The configured engine, whose workers are starting.
-
-    Args:
-        should_stop, log, on_wait, on_compile: as in `Engine`.
-        on_refusal: as in `ray_engine`.
-        at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
-        outputs: see `WorkerSpec.outputs`.
-    """
-    require_no_import_of_a_task()
-    task, compute = task_of(config), config.compute
-    spec = worker_spec(config, task, outputs)
-    most = work_at_once(config) if at_once is None else at_once
-    limits = dispatch_limits(config, most)
-    engine: Engine[Any]
-    if compute.engine == "inline":
-        threads = compute.inline_workers == "threads"
-        gpus = compute.worker_resources.gpu
-        engine = inline_engine(spec, limits, should_stop, threads=threads, gpus=gpus, log=log, on_compile=on_compile)
-    else:
-        from es_service.dispatch.ray_engine import ray_engine
-
-        engine = ray_engine(
-            spec,
-            limits,
-            should_stop,
-            actor=WorkerActor,
-            address=compute.address,
-            cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
-            gpus=compute.worker_resources.gpu,
-            most=most,
-            grows=compute.workers == "auto",
-            log=log,
-            on_wait=on_wait,
-            on_compile=on_compile,
-            on_refusal=on_refusal,
-        )
-    if task.kind in ("python", "function"):  # errors name the episodes or the calls that ended workers
-        engine.describe = partial(described, spec, task.parameters)
-    return engine
 
 
 def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:

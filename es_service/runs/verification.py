@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.config.workload import worker_spec
-from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop import driver
 from es_service.loop.clock import Clock
@@ -26,16 +24,14 @@ from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.certification import platform_of, workers_for
 from es_service.runs.certified import Certified, Elsewhere, all_certifications, arrays_of
-from es_service.runs.checked_config import changed_config
+from es_service.runs.engine import engine_here
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.other_task import stored_task
 from es_service.runs.repeating import why_task_does_not_repeat
 from es_service.runs.selection import Episodes, new_episodes
-from es_service.runs.session import dispatch_limits, initial_centres, initial_statistics
-from es_service.runs.signals import stop_on_signals
+from es_service.runs.session import initial_centres, initial_statistics
 from es_service.runs.view import Run
-from es_service.runs.worker_count import on_this_machine
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
 from es_service.store.codec import changed_sum, encode_changes, rows_listed, state_sha256, state_sum, stored_values
@@ -92,8 +88,7 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
 
 
 def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recomputed]:
-    stored = run.present_config
-    config = changed_config(stored, on_this_machine(stored, workers), name=str(run.config_file))
+    config = evaluation_config(run, workers)
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
     plan = _plan(run, generations)
     search = driver.Search(
@@ -103,12 +98,7 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
         task=task,
         statistics=lambda: initial_statistics(reader.read_start(run.folder)),
     )
-    with (
-        stop_on_signals() as should_stop,
-        inline_engine(
-            worker_spec(config, task), dispatch_limits(config), should_stop, gpus=config.compute.worker_resources.gpu
-        ) as engine,
-    ):
+    with engine_here(config) as engine:
         for begin, last in plan:
             reached, differences = _recompute(run, search, engine, begin, last)
             then = next((platform for first, platform in reversed(platforms) if first <= reached), {})

@@ -26,7 +26,8 @@ from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.errors import ConfigError, StoreError
 from es_service.runs import worker_count as counting
-from es_service.runs.session import dispatch_limits, initial_centres
+from es_service.runs.engine import dispatch_limits
+from es_service.runs.session import initial_centres
 from es_service.runs.worker_count import on_this_machine, worker_count
 
 CONFIG = {

@@ -72,7 +72,7 @@ def engine(worker, monkeypatch):
         yield worker
 
     monkeypatch.setattr(session, "make_engine", ours)
-    monkeypatch.setattr(verification, "inline_engine", ours)
+    monkeypatch.setattr(verification, "engine_here", ours)
 
 
 def computed(folder, *overrides):

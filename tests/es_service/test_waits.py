@@ -25,8 +25,8 @@ from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.dispatch.waits import AGAIN_S, NOTICE_S, SILENCE_S, Waits
 from es_service.protocol.messages import Chunk
-from es_service.runs import compiling, evaluation, session
-from es_service.runs.compiling import compiling_sentence, note_compiled, was_compiled
+from es_service.runs import engine, evaluation, session
+from es_service.runs.engine import compiling_sentence, note_compiled, was_compiled
 from es_service.runs.run_status import doing, read_status
 from tests.helpers import spec, workers_in_this_process
 from tests.system.session import SMALL
@@ -94,7 +94,7 @@ def test_what_was_compiled_before_is_remembered_with_all_that_the_code_depends_o
     changed = (spec(episode_steps=9), spec(rollout="simd"), spec(sources={"workers/worker.py": "0"}))
     assert not any(was_compiled(one, kind) for one in changed)
     assert not was_compiled(spec(), other)
-    monkeypatch.setattr(compiling, "MOST_FILES", 1)
+    monkeypatch.setattr(engine, "MOST_FILES", 1)
     note_compiled(spec(), other)
     assert len(list((tmp_path / "es-service" / "compiled").iterdir())) == 1
 
@@ -107,7 +107,7 @@ def test_a_cache_that_cannot_be_written_only_makes_it_the_first_time(tmp_path, m
 
 
 def test_every_kind_of_chunk_has_words():
-    assert {kind.__name__ for kind in Chunk.__args__} == set(compiling.CONTENTS)
+    assert {kind.__name__ for kind in Chunk.__args__} == set(engine.CONTENTS)
 
 
 def test_a_run_says_how_long_it_places_centroids_and_a_resumed_one_has_them(tmp_path, monkeypatch):

@@ -332,7 +332,7 @@ def test_there_must_be_something_to_certify(finished):
 @pytest.mark.parametrize("wrong", [{"episodes": 1}, {"keep": 0}, {"top": -1}, {"keep": 1.5}, {"by": "luck"}])
 def test_wrong_numbers_are_refused_before_anything_runs(finished, monkeypatch, wrong):
     run, _ = finished
-    monkeypatch.delattr(certification, "workers_of")
+    monkeypatch.delattr(certification, "engine_here")
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         certify_run(run.folder, **wrong)
 

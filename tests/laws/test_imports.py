@@ -46,7 +46,7 @@ JOINERS = {
     "es_service.environments.single",
     "es_service.environments.spaces",
     "es_service.environments.vector",
-    "es_service.runs.compiling",
+    "es_service.runs.engine",
     "es_service.runs.snapshot",
     "es_service.runs.repeating",
     "es_service.runs.scaling",

@@ -148,7 +148,7 @@ def test_options_of_the_run_are_those_of_the_other_task_unless_set(of_python):
 def test_what_does_not_fit_the_policies_is_refused_before_workers_start(
     of_python, monkeypatch, task, overrides, message
 ):
-    monkeypatch.delattr(certification, "workers_of")
+    monkeypatch.delattr(certification, "engine_here")
     with pytest.raises(ConfigError, match=message):
         certify_run(of_python.folder, task=f"{TASKS}{task}", overrides=overrides)
 

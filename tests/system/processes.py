@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from es_service.errors import StoreError
-from es_service.runs import session
+from es_service.runs import engine
 from es_service.store.reader import read_generation
 
 ROOT = Path(__file__).parents[2]
@@ -84,5 +84,5 @@ def is_running(pid: int | str) -> bool:
 
 def without_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     """No work item is sent a second time, so that only a deadline notices a worker that hangs."""
-    limits = session.dispatch_limits
-    monkeypatch.setattr(session, "dispatch_limits", lambda *given: replace(limits(*given), late_factor=math.inf))
+    limits = engine.dispatch_limits
+    monkeypatch.setattr(engine, "dispatch_limits", lambda *given: replace(limits(*given), late_factor=math.inf))

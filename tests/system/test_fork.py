@@ -22,9 +22,9 @@ from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.options import choice
 from es_service.report.data import read_run
 from es_service.report.facts import verdict
-from es_service.runs import checked_config, evaluation, lineage, sessions
+from es_service.runs import checked_config, engine, evaluation, lineage, sessions
+from es_service.runs.engine import dispatch_limits
 from es_service.runs.run_status import more, read_status
-from es_service.runs.session import dispatch_limits
 from es_service.store import reader
 from es_service.store.digest import digest_at
 from es_service.store.reader import read_generation
@@ -268,7 +268,7 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
     seen = []
     monkeypatch.setattr(
-        evaluation, "dispatch_limits", lambda config, most: seen.append(config) or dispatch_limits(config, most)
+        engine, "dispatch_limits", lambda config, most: seen.append(config) or dispatch_limits(config, most)
     )
     list(evaluation.evaluate(run, [], episodes=1, workers=1))
     assert seen[0].compute.compile_timeout_s == 77.0

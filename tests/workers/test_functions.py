@@ -21,8 +21,8 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import evaluation_reset_keys
 from es_service.report.write import write_report
+from es_service.runs.engine import dispatch_limits
 from es_service.runs.export import arrays, tables
-from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import functions

@@ -29,8 +29,8 @@ from es_service.protocol.noise import (
 from es_service.protocol.options import defaults_of
 from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
+from es_service.runs.engine import dispatch_limits
 from es_service.runs.replay import record
-from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import host_tasks
