@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from es_service.api import Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
     from es_service.asking import ask_tell
+    from es_service.dispatch.staying import workers
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
     from es_service.runs.certification import certify, certify_run
@@ -35,6 +36,7 @@ __all__ = [
     "run",
     "run_or_resume",
     "sweep",
+    "workers",
     "write_comparison",
     "write_report",
 ]
@@ -46,6 +48,7 @@ _MODULES = {
     "sweep": "es_service.runs.sweep",
     "write_comparison": "es_service.report.write",
     "write_report": "es_service.report.write",
+    "workers": "es_service.dispatch.staying",
 }
 """Name -> its module, if that is not `es_service.api`."""
 

@@ -30,7 +30,6 @@ from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable
 from workers.host.noise import gradient_summer, members
 from workers.host.seeds import seed_of
-from workers.rollouts.asked import Asked
 from workers.rollouts.backend import ChunkFunctions, Episodes
 from workers.worker import Kind, kinds_of
 
@@ -160,15 +159,10 @@ def _episodes(spec: WorkerSpec, told: EpisodesResult, rows: slice, is_told: Any,
 
 
 def _kinds(spec: WorkerSpec) -> dict[Any, Kind]:
-    return kinds_of(spec, _Arguments())
+    """Kinds of chunks of which only the arguments matter, and the function of gradients."""
 
+    def nothing(*_: Any) -> None:
+        return None
 
-class _Arguments(Asked):
-    """Functions of which only the arguments matter, and that of gradients."""
-
-    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        def nothing(*_: Any) -> None:
-            return None
-
-        functions = (nothing, nothing, nothing, gradient_summer(spec))
-        return ChunkFunctions(*(Compilable(function, nothing) for function in functions))
+    functions = (nothing, nothing, nothing, gradient_summer(spec))
+    return kinds_of(spec, ChunkFunctions(*(Compilable(function, nothing) for function in functions)))

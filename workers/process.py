@@ -10,13 +10,14 @@ import os
 import socket
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LackingError
@@ -34,16 +35,20 @@ from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here
     from workers.compilable import Compilable
+    from workers.rollouts.backend import ChunkFunctions
 
 REPORT_S = 0.5
 """Seconds between two looks at how far a worker is. Nothing is sent of work that is done sooner."""
+MOST_KNOWN = 4
+"""For the constants of so many runs, a process that stays has compiled functions at most."""
 
 
 def main(descriptor: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
-    The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
-    worker's socket. A worker receives ("subject", number, Subject), ("parents", {name: parameters or Origin}) and
+    The parent sends over this socket the byte "s" and the WorkerSpec of a run, and then for each of its workers one
+    byte with the descriptor of the worker's socket; for another run, when these workers have ended, the same again. A
+    worker receives ("subject", number, Subject), ("parents", {name: parameters or Origin}) and
     ("chunks", item, attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It
     sends ("broken", RaisedError), or ("up", `platform_of_gpu`) and then for each work item ("results", item, attempt,
     [ChunkResult]), ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies,
@@ -53,34 +58,49 @@ def main(descriptor: int) -> None:
     """
     os.set_inheritable(descriptor, False)
     with socket.socket(fileno=descriptor) as control:
+        runs: SimpleQueue[tuple[Future[Made | RaisedError], WorkerSpec]] = SimpleQueue()
+        before: dict[str, tuple[ChunkFunctions, set[str]]] = {}
         try:
-            spec = receive(control)
-            made: Future[Compilable | RaisedError] = Future()
-            threading.Thread(target=_accept, args=(control, made, spec), daemon=True).start()
-            made.set_result(_make_run_chunks(spec))  # in the main thread, since some libraries of users demand it
-            threading.Event().wait()
+            threading.Thread(target=_accept, args=(control, runs), daemon=True).start()
+            while True:  # in the main thread, since some libraries of users demand it
+                made, spec = runs.get()
+                made.set_result(_made(spec, before))
         except Exception:
             traceback.print_exc()
     os._exit(0)
 
 
-def _accept(control: socket.socket, made: Future[Compilable | RaisedError], spec: WorkerSpec) -> None:
+class Made(NamedTuple):
+    """What computes the chunks of a run."""
+
+    run_chunks: Compilable
+    compiled: set[str]
+    """Kinds of chunks for which this process has compiled."""
+
+
+def _accept(control: socket.socket, runs: SimpleQueue[tuple[Future[Made | RaisedError], WorkerSpec]]) -> None:
     """Serve a worker for each socket that comes, until the parent closes its end; this ends the process."""
     try:
-        while (given := _descriptor(control)) is not None:
-            threading.Thread(target=_work, args=(given, made, spec), daemon=True).start()
+        run = None
+        while (given := _next(control)) is not None:
+            if not isinstance(given, int):
+                runs.put(run := (Future(), given))
+            elif run is not None:
+                threading.Thread(target=_work, args=(given, *run), daemon=True).start()
     except Exception:
         traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
 
 
-def _descriptor(control: socket.socket) -> int | None:
-    """File descriptor of the next worker's socket; None when the parent has closed its end.
+def _next(control: socket.socket) -> int | WorkerSpec | None:
+    """The file descriptor of a worker's socket, or the constants of a run; None when the parent has closed its end.
 
     Raises:
         OSError: the parent's message came without a descriptor.
     """
     byte, descriptors, _, _ = socket.recv_fds(control, 1, 1, getattr(socket, "MSG_CMSG_CLOEXEC", 0))
+    if byte == b"s":
+        return receive(control)
     if byte and not descriptors:
         raise OSError(
             "the parent's message has no file descriptor for a worker's socket; the limit of open files may be too low"
@@ -90,20 +110,29 @@ def _descriptor(control: socket.socket) -> int | None:
     return descriptors[0] if descriptors else None
 
 
-def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
-    """Function that runs chunks, or the reason why there is none: other code, or an error."""
+def _made(spec: WorkerSpec, before: dict[str, tuple[ChunkFunctions, set[str]]]) -> Made | RaisedError:
+    """What computes the chunks of a run, or the reason why there is nothing: other code, or an error.
+
+    Args:
+        before: functions for the constants of earlier runs, and for which kinds they have been compiled.
+    """
     if problem := why_refused(spec.sources, spec.task_code, spec.platform):
         return RaisedError(problem, "")
     os.environ.update(xla_cache_settings())
     try:
         from workers.worker import make_worker
 
-        return make_worker(spec)
+        of_any_seed = replace(spec, seed=0)
+        known = before.pop(repr(of_any_seed), None) or (BACKENDS[spec.rollout].chunk_functions(of_any_seed), set())
+        before[repr(of_any_seed)] = known  # the newest is last
+        for old in list(before)[:-MOST_KNOWN]:
+            del before[old]
+        return Made(make_worker(spec, known[0]), known[1])
     except BaseException as error:  # also sys.exit in an environment
         return raised(error, *spec.task_code)
 
 
-def _work(descriptor: int, made: Future[Compilable | RaisedError], spec: WorkerSpec) -> None:
+def _work(descriptor: int, made: Future[Made | RaisedError], spec: WorkerSpec) -> None:
     """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
@@ -114,48 +143,50 @@ def _work(descriptor: int, made: Future[Compilable | RaisedError], spec: WorkerS
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, made: Future[Compilable | RaisedError], spec: WorkerSpec) -> None:
+def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: WorkerSpec) -> None:
     """Receive chunks and send their results; does not return unless the worker is broken."""
-    said = _Said(parent)
-    with said.progress():
-        run_chunks = made.result()
-    if isinstance(run_chunks, RaisedError):
-        said.say("broken", run_chunks)
-        return
-    said.say("up", platform_of_gpu(spec.rollout))
-    subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
-    parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
-    compiled: set[str] = set()
-    # Threads of one process would report the progress of others, and hide one that hangs.
-    progress_of_item = nullcontext if BACKENDS[spec.rollout].runs_in_threads else said.progress
-    while True:
-        match receive(parent):
-            case ("subject", number, subject):
-                subjects.add(number, subject)
-            case ("parents", given):
-                parents.receive(given)
-            case ("chunks", item, attempt, chunks):
-                try:
-                    with progress_of_item():
-                        work = parents.complete([(subjects[number], chunk) for number, chunk in chunks])
-                        if (kind := type(work[0][1]).__name__) not in compiled:
-                            seconds = run_chunks.seconds_to_compile(work)
-                            compiled.add(kind)
-                            said.say("compiled", kind, seconds)
-                        answer = ("results", item, attempt, run_chunks(work))
-                except LackingError:
-                    answer = ("lacks", item, attempt)
-                except BaseException as error:  # also sys.exit in an environment
-                    answer = ("failure", item, attempt, raised(error, *spec.task_code))
-                said.say(*answer)
-                forget_old_subjects(subjects)
+    with closing(_Said(parent)) as said:
+        with said.progress():
+            ready = made.result()
+        if isinstance(ready, RaisedError):
+            said.say("broken", ready)
+            return
+        said.say("up", platform_of_gpu(spec.rollout))
+        subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
+        parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
+        compiled: set[str] = set()
+        # Threads of one process would report the progress of others, and hide one that hangs.
+        progress_of_item = nullcontext if BACKENDS[spec.rollout].runs_in_threads else said.progress
+        while True:
+            match receive(parent):
+                case ("subject", number, subject):
+                    subjects.add(number, subject)
+                case ("parents", given):
+                    parents.receive(given)
+                case ("chunks", item, attempt, chunks):
+                    try:
+                        with progress_of_item():
+                            work = parents.complete([(subjects[number], chunk) for number, chunk in chunks])
+                            if (kind := type(work[0][1]).__name__) not in compiled:
+                                known = kind in ready.compiled
+                                seconds = 0.0 if known else ready.run_chunks.seconds_to_compile(work)
+                                compiled.add(kind)
+                                ready.compiled.add(kind)
+                                said.say("compiled", kind, seconds)
+                            answer = ("results", item, attempt, ready.run_chunks(work))
+                    except LackingError:
+                        answer = ("lacks", item, attempt)
+                    except BaseException as error:  # also sys.exit in an environment
+                        answer = ("failure", item, attempt, raised(error, *spec.task_code))
+                    said.say(*answer)
+                    forget_old_subjects(subjects)
 
 
 class _Said:
     """What a worker says to its parent: answers, and from a thread of its own how far it is with what takes long."""
 
     def __init__(self, parent: socket.socket) -> None:
-        self._parent, self._turn, self._now = parent, threading.Lock(), 0
+        self._parent, self._turn, self._now, self._closed = parent, threading.Lock(), 0, threading.Event()
         threading.Thread(target=self._report, daemon=True, name="reports progress").start()
 
     def say(self, *message: Any) -> None:
@@ -174,12 +205,15 @@ class _Said:
             with self._turn:
                 self._now += 1
 
+    def close(self) -> None:
+        """Report nothing any more."""
+        self._closed.set()
+
     def _report(self) -> None:
         """Send what has changed between two looks, if both are at the same work."""
         before: tuple[int, Seen] | None = None
         with suppress(OSError):  # the parent has closed its end
-            while True:
-                time.sleep(REPORT_S)
+            while not self._closed.wait(REPORT_S):
                 with self._turn:
                     now = self._now, progress.seen()
                     if self._now % 2 and before is not None and before[0] == now[0] and before[1] != now[1]:

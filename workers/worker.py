@@ -39,7 +39,7 @@ from workers import progress
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
-from workers.rollouts.backend import Episodes, RolloutBackend, lane_of
+from workers.rollouts.backend import ChunkFunctions, Episodes, lane_of
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 
@@ -54,15 +54,18 @@ class Kind(NamedTuple):
     """Function from the group and what `function` has computed to the results of its chunks."""
 
 
-def make_worker(spec: WorkerSpec) -> Compilable:
+def make_worker(spec: WorkerSpec, functions: ChunkFunctions | None = None) -> Compilable:
     """Function from the chunks of a work item to their results; `compile` compiles what their kind uses.
 
     If the rollout takes chunks together, the episodes of neighbouring chunks around one centre run in one call of its
     function, and so do those of a few neighbouring policy chunks; else each chunk runs alone. A note on an exception
     names the chunk that raised it. Gradient blocks are added as far as the work item has the neighbours.
+
+    Args:
+        functions: those of the rollout for a spec that is the same but for the seed; None: they are made.
     """
     backend = BACKENDS[spec.rollout]
-    kinds = kinds_of(spec, backend)
+    kinds = kinds_of(spec, functions or backend.chunk_functions(spec))
     groups = partial(_groups, together=backend.takes_chunks_together)
 
     def compile_group(kind: Kind, work: Sequence[Work]) -> list[ChunkResult]:
@@ -96,9 +99,8 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 
 
-def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kind]:
+def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], Kind]:
     """How a run's chunks of each kind are computed."""
-    functions = backend.chunk_functions(spec)
     gradient_sum = functions.gradient_sum
 
     def training_arguments(work: Sequence[tuple[Centre, TrainingChunk]]) -> tuple[Any, ...]:

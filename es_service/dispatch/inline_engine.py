@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 
 from es_service.dispatch.dispatch_log import Log, no_log
@@ -31,6 +31,7 @@ from es_service.dispatch.events import (
     with_last_words,
 )
 from es_service.dispatch.gpus import places
+from es_service.dispatch.staying import staying
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
@@ -51,6 +52,7 @@ def inline_engine(
     *,
     threads: bool = False,
     gpus: float = 0.0,
+    alone: bool = False,
     log: Log = no_log,
     on_compile: Callable[[str, str], None] = lambda kind, text: None,
 ) -> Engine[ChildProcesses]:
@@ -61,9 +63,11 @@ def inline_engine(
         limits: number of workers, deadlines and numbers of attempts.
         threads: whether workers are threads of one child, which takes less memory; if one is lost, all are lost.
         gpus: GPUs of each worker, or the share of one. There must be room for `limits.workers`, see `gpus.places`.
+        alone: whether a process serves only runs with the same constants, whatever their seed, if it stays.
         should_stop, log, on_compile: as in `Engine`.
     """
-    return Engine(ChildProcesses(spec, threads=threads, gpus=gpus), limits, should_stop, log, on_compile=on_compile)
+    transport = ChildProcesses(spec, threads=threads, gpus=gpus, alone=alone)
+    return Engine(transport, limits, should_stop, log, on_compile=on_compile)
 
 
 @dataclass(eq=False)
@@ -73,6 +77,8 @@ class _Worker:
     child: Child
     place: str
     """The GPUs that the child may use, as CUDA_VISIBLE_DEVICES names them."""
+    use: Hashable
+    """What the child can be used for, if it stays."""
     channel: Channel
     parents: KeptParents[int]
     """Sizes of the parents of policies that it keeps."""
@@ -87,8 +93,10 @@ class _Worker:
 class ChildProcesses:
     """Transport whose workers are child processes, or threads of one child process."""
 
-    def __init__(self, spec: WorkerSpec, *, threads: bool = False, gpus: float = 0.0) -> None:
+    def __init__(self, spec: WorkerSpec, *, threads: bool = False, gpus: float = 0.0, alone: bool = False) -> None:
         self._spec, self._threads = framed(spec), threads
+        same = repr(replace(spec, seed=0)) if alone else (spec.rollout, spec.output_bytes, *spec.sources.items())
+        self._use: Hashable = same
         self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
         self._platforms: set[str] = set()
         self._parent_cache_bytes, self._output_bytes = spec.parent_cache_bytes, spec.output_bytes
@@ -109,14 +117,16 @@ class ChildProcesses:
                 ours, theirs = map(undo.enter_context, socket_pair())
                 running = next(iter(self._workers.values()), None) if self._threads else None
                 place = self._free_place() if running is None else running.place
-                child = undo.enter_context(self._start_child(place)) if running is None else running.child
+                use, child = self._child_for(place) if running is None else (running.use, running.child)
+                if running is None:
+                    undo.callback(child.end)
                 socket.send_fds(child.socket, [b"w"], [theirs.fileno()])
             except OSError as error:  # no more processes, file descriptors or disk space, or the child has just ended
                 self._ready.append(WorkerLost(worker, f"worker {worker} cannot be started: {error}"))
                 return
             undo.pop_all()
         theirs.close()
-        self._add(worker, child, ours, place)
+        self._add(worker, child, ours, place, use)
         self._ready.append(Placed(worker))
 
     def kill(self, worker: int) -> str:
@@ -176,31 +186,44 @@ class ChildProcesses:
         return self._ready.popleft()
 
     def close(self) -> None:
-        """Kill all children and wait until they have ended."""
-        for worker in self._workers.values():
-            worker.child.kill()  # kill all before waiting, since each takes some time to free its memory
-        for worker in list(self._workers):
-            self.kill(worker)
+        """Kill all children and wait until they have ended; in a block of `workers`, those with nothing to do stay."""
+        busy = {worker.child for worker in self._workers.values() if worker.unanswered or worker.channel.is_full}
+        idle = {worker.child: worker.use for worker in self._workers.values() if worker.child not in busy}
+        for child in busy:
+            child.kill()  # kill all before waiting, since each takes some time to free its memory
+        for number in list(self._workers):
+            self._forget(number)
+        for child in busy:
+            child.end()
+        for child, use in idle.items():
+            staying().give(use, child)
 
     def _free_place(self) -> str:
         """The place at the GPUs that has the fewest workers."""
         taken = [worker.place for worker in self._workers.values()]
         return min(self._places, key=lambda place: taken.count(place) / self._places.count(place), default="")
 
-    def _start_child(self, place: str) -> Child:
-        """A new process that has been sent the constants of the run."""
-        child = Child("workers.process", child_environment(self._gpus, place), self._output_bytes)
-        child.socket.sendall(self._spec)
-        child.socket.setblocking(False)  # if it does not take its workers' sockets, they cannot be started
-        return child
+    def _child_for(self, place: str) -> tuple[Hashable, Child]:
+        """A process that has been sent the constants of the run, one that has stayed or a new one; and its use."""
+        environment = child_environment(self._gpus, place)
+        use = self._use, os.getcwd(), *sorted(environment.items())
+        child = staying().take(use) or Child("workers.process", environment, self._output_bytes)
+        try:
+            child.socket.setblocking(True)
+            child.socket.sendall(b"s" + self._spec)
+            child.socket.setblocking(False)  # if it does not take its workers' sockets, they cannot be started
+        except BaseException:
+            child.end()
+            raise
+        return use, child
 
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
         """A new number for a subject, and the message with both."""
         number = next(self._numbers)
         return number, framed(("subject", number, as_sent(subject)))
 
-    def _add(self, number: int, child: Child, ours: socket.socket, place: str = "") -> None:
-        self._workers[number] = _Worker(child, place, Channel(ours), KeptParents(self._parent_cache_bytes, int))
+    def _add(self, number: int, child: Child, ours: socket.socket, place: str = "", use: Hashable = None) -> None:
+        self._workers[number] = _Worker(child, place, use, Channel(ours), KeptParents(self._parent_cache_bytes, int))
         self._by_descriptor[ours.fileno()] = number
         self._poll.register(ours, select.POLLIN)
 

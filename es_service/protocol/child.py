@@ -182,6 +182,11 @@ class Child:
         """Whether `end` was called, by whomever."""
         return not self._finalize.alive
 
+    @property
+    def is_running(self) -> bool:
+        """Whether its process runs."""
+        return not self.is_ended and self._process.poll() is None
+
     def forget_output(self) -> None:
         """Begin anew with what it prints."""
         if self._log is not None:

@@ -41,6 +41,8 @@ class Rollout(Protocol):
     """Whether an episode's bits do not depend on the others of its call, so that neighbouring chunks may share one."""
     copies_late_items: bool = True
     """Whether a work item may be sent to a second worker while a first one, which is late with it, still lives."""
+    shares_processes: bool = True
+    """Whether a process of workers may serve runs with other constants, one after another; see `staying.py`."""
     compile_s: tuple[int, int]
     """About how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with the
     code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said.

@@ -79,11 +79,12 @@ def make_engine(
         on_compile(compiling_sentence(spec, kind, text, here=here))
 
     log = noting(log, spec) if here else log
+    alone = not BACKENDS[spec.rollout].shares_processes
     threads, gpus = compute.inline_workers == "threads", compute.worker_resources.gpu
     engine: Engine[Any]
     if compute.engine == "inline":
         engine = inline_engine(
-            spec, limits, should_stop, threads=threads, gpus=gpus, log=log, on_compile=tell_compiling
+            spec, limits, should_stop, threads=threads, gpus=gpus, alone=alone, log=log, on_compile=tell_compiling
         )
     else:
         from es_service.dispatch.ray_engine import ray_engine

@@ -89,7 +89,7 @@ class Threads(inline_module.ChildProcesses):
         child = Child("tests.es_service.shell_child", child_environment())
         ours, theirs = socket_pair()
         computing: Future[Any] = Future()
-        computing.set_result(COMPUTING)
+        computing.set_result(process.Made(COMPUTING, set()))
         given = theirs.detach(), computing, self.theirs
         threading.Thread(target=process._work, args=given, daemon=True).start()
         self._add(worker, child, ours)

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import optuna
 
-from es_service import Stop, load_config, run
+from es_service import Stop, load_config, run, workers
 
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 50},
@@ -45,7 +45,8 @@ def search(trials: int, generations: int, folder: Path, seed: int = 0) -> optuna
         sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=3),
         pruner=optuna.pruners.MedianPruner(n_startup_trials=2, n_warmup_steps=3),
     )
-    study.optimize(mean_fitness, n_trials=trials)
+    with workers():  # which stay from one trial to the next
+        study.optimize(mean_fitness, n_trials=trials)
     return study
 
 

@@ -36,6 +36,7 @@ class Host(RolloutBackend):
     compile_s = (0, 0)
     chunk_pairs = (8, 8)
     copies_late_items = False
+    shares_processes = False
 
     def pair_limits(self, task: TaskSpec) -> tuple[int, int]:
         """One pair of calls, which may take long, or as many environments as an evaluation has."""

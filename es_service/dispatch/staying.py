@@ -1,0 +1,103 @@
+"""Workers that stay: processes of workers that wait for the next run of this program."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from threading import Lock
+
+from es_service.dispatch.cores import cores
+from es_service.protocol.child import Child
+
+IDLE_PER_CORE = 2
+"""Most processes that wait, for each core: those of two kinds of runs that take turns."""
+
+
+class Staying:
+    """The processes of this program that wait."""
+
+    def __init__(self) -> None:
+        self._idle: list[tuple[Hashable, Child]] = []
+        """What a process can be used for, and the process; the one that has waited longest is first."""
+        self._blocks, self._turn, self._maker = 0, Lock(), os.getpid()
+
+    def take(self, use: Hashable) -> Child | None:
+        """A process that waits and can be used for this, the newest; None if there is none."""
+        with self._turn:
+            fitting = [entry for entry in self._idle if entry[0] == use]
+            self._idle = [entry for entry in self._idle if entry[0] != use]
+            while fitting:
+                _, child = fitting.pop()
+                if child.is_running:
+                    self._idle += fitting
+                    child.forget_output()
+                    return child
+                child.end()
+        return None
+
+    def give(self, use: Hashable, child: Child) -> None:
+        """Let a process that has nothing left to do wait, inside a block of `workers`; elsewhere end it."""
+        with self._turn:
+            self._idle += [(use, child)]
+            most = IDLE_PER_CORE * cores() if self._blocks else 0
+            ended = [self._idle.pop(0) for _ in range(len(self._idle) - most)]
+        _end(ended)
+
+    def enter(self) -> None:
+        """A block of `workers` begins."""
+        with self._turn:
+            self._blocks += 1
+
+    def leave(self) -> None:
+        """A block ends, and with the last one the processes. Those of a process that was forked are the other one's."""
+        if os.getpid() != self._maker:
+            return
+        with self._turn:
+            self._blocks -= 1
+            ended, self._idle = ([], self._idle) if self._blocks else (self._idle, [])
+        _end(ended)
+
+
+def _end(entries: list[tuple[Hashable, Child]]) -> None:
+    for _, child in entries:
+        child.kill()  # all before waiting, since each takes some time to free its memory
+    for _, child in entries:
+        child.end()
+
+
+def staying() -> Staying:
+    """The processes of this program that wait."""
+    return _of(os.getpid())
+
+
+@cache
+def _of(process: int) -> Staying:
+    return Staying()
+
+
+@contextmanager
+def workers() -> Iterator[None]:
+    """Inside the block, workers of the engine `inline` stay when a run or an evaluator ends, and serve the next ones.
+
+        with es_service.workers():
+            for sigma in (0.02, 0.05, 0.1):
+                es_service.run(load_config("point_maze_es", [f"search.sigma={sigma}"]), f"runs/{sigma}")
+
+    The next `run`, `resume`, `fork`, `evaluator`, `certify_run` or `verify` of this program, in whatever thread, takes
+    over the processes that wait, if the code of its task, its rollout and the environment variables are the same. They
+    have loaded JAX, and have compiled whatever they have computed before: only another task, policy, number of episodes
+    or size of chunks is compiled anew. An environment of Python objects or a function has a process only for runs with
+    the same task and policy. All results have the bits that they have without the block.
+
+    A worker that was lost, or was computing when its run ended, does not stay. Two processes wait for each core at
+    most. What the code of a task has read from a file or changed in its modules stays, too. Blocks can be nested:
+    nothing is left running after the last one. Workers of a Ray cluster do not stay, and runs of `ask_tell` have none.
+    """
+    here = staying()
+    here.enter()
+    try:
+        yield
+    finally:
+        here.leave()
