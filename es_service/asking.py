@@ -42,7 +42,7 @@ from es_service.runs.session import OnNotice, Outcome, warn
 from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
-from workers.asking import Rows, gradients, results_of, rows_of
+from workers.asked_rows import Rows, gradients, results_of, rows_of
 from workers.host.policies import LanePolicies
 
 MOST_STEPS = 2**31 - 1

@@ -156,11 +156,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/common.py"
-NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/starts.py"
+NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/common.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
 RECIPES = "es_service/protocol/recipes.py"
 KEPT_PARENTS = "es_service/protocol/kept_parents.py"
-ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
+ADAM, SHAPING = "es_service/search/steps.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, ARRAYS = "es_service/search/maps/behaviour_map.py", "es_service/loop/arrays.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
@@ -171,7 +171,7 @@ XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
 LOW_RANK = "es_service/protocol/low_rank.py"
 LOW_RANK_OF_KERNELS = "workers/simd/episodes/low_rank.py"
-LOW_RANK_OF_XLA = "workers/policies/low_rank.py"
+LOW_RANK_OF_XLA = "workers/policies/pairs.py"
 NOISE_OF_KERNELS = "workers/simd/episodes/noise.py"
 
 OF_NOVELTY, OF_NOVELTY_SEARCH = "tests/es_service/test_novelty.py", "tests/laws/test_novelty_search.py"
@@ -416,7 +416,7 @@ CASES = [
         "tests/workers/test_low_rank.py",
         ("is not divided by the root of its rank", LOW_RANK, "NORMAL_STD * math.sqrt(rank)", "NORMAL_STD"),
         ("uses the numbers of A for B", LOW_RANK, "drawn[..., right]", "drawn[..., right - right.min()]"),
-        ("of both members has one sign, xla", LOW_RANK_OF_XLA, "unit * SIGNS_S", "unit * SIGNS_S**2"),
+        ("of both members has one sign, xla", LOW_RANK_OF_XLA, "step_S = unit * SIGNS_S", "step_S = unit * SIGNS_S**2"),
         (
             "forgets the sign of a member's biases, simd",
             LOW_RANK_OF_KERNELS,
@@ -425,7 +425,7 @@ CASES = [
         ),
         (
             "of a gradient takes another input's number, simd",
-            "workers/simd/episodes/low_rank_gradient.py",
+            "workers/simd/episodes/low_rank.py",
             "(left, 1), (at_left, 1), (i, 1)",
             "(left, 1), (at_left, 1), (j, 1)",
         ),

@@ -78,9 +78,8 @@ class WorkerActor:
             del os.environ[name]
         os.environ.update({DEPTH: "1"} | environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
-        from workers.gpu import platform_of_gpu
         from workers.parents import Parents
-        from workers.rollouts import BACKENDS
+        from workers.rollouts import BACKENDS, platform_of_gpu
 
         self._task_code = spec.task_code
         self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)

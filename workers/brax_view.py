@@ -21,7 +21,7 @@ from es_service.protocol.options import OptionValue, defaults_of
 from workers.environments import make_environment
 from workers.environments.brax_parts import quietly
 from workers.lanes import task_named
-from workers.lanes.functions import Seen, lane_functions
+from workers.lanes.blocks import LaneResults, lane_functions
 
 with quietly():
     from brax.envs.base import Env, State, Wrapper
@@ -90,7 +90,7 @@ class TaskBraxEnv(Env):
         """The option `backend` of a task of Brax; of others the physics of the shipped ants."""
         return self._backend
 
-    def _info(self, seen: Seen) -> dict[str, Any]:
+    def _info(self, seen: LaneResults) -> dict[str, Any]:
         distance = {"goal_distance": seen.goal_distance} if self.task.has_goal else {}
         return {"descriptor": seen.descriptor, "success": seen.success} | distance
 

@@ -2,11 +2,14 @@
 
 `normalised_observation` and `advance` together are one control step; the policy acts between them. A finished episode
 continues to be computed but is masked, so steps after `done` never count.
+
+OUTPUTS are computed only if a run names them, besides what every result has; `es_service/protocol/outputs.py` has their
+names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +19,93 @@ from jax import lax
 
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
+from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from workers.environments import Environment
-from workers.outputs import Step, named_outputs
-from workers.policies.outputs import action, drawn_action
-from workers.policies.policy import initial_memory, normalise
+from workers.policies.policy import action, drawn_action, initial_memory, normalise
 from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
+
+
+class EpisodeStep(NamedTuple):
+    """One step of an episode."""
+
+    before: Any
+    """State of the environment before the step."""
+    action_A: Any
+    """Action as the environment gets it, with its noise."""
+    state: Any
+    """State after the step."""
+    reward: Any
+    done: Any
+
+
+class EpisodeOutput(NamedTuple):
+    """An output as pure functions of one episode; its value is an array whose shape and dtype stay the same.
+
+    The result of an episode has the value after its last valid step. An output of `OF_STEPS` has that after each of
+    them instead.
+    """
+
+    begin: Callable[[Environment, Any, Any], Any]
+    """Function (environment, state of the reset, action of zeros [A]) -> value before the first step."""
+    after: Callable[[Environment, EpisodeStep, Any], Any]
+    """Function (environment, step, value before it) -> value after it. Steps after `done` never count."""
+
+
+def named_outputs(names: Sequence[str]) -> dict[str, EpisodeOutput]:
+    """The outputs with these names. Raises ValueError for a name that none has."""
+    unknown = sorted({*names} - {*OUTPUTS})
+    if unknown:
+        raise ValueError(f"no output of episodes has the name {unknown[0]!r}; choose among {', '.join(OUTPUTS)}")
+    return {name: OUTPUTS[name] for name in names}
+
+
+def _of_state(value: Callable[[Environment, Any], Any]) -> EpisodeOutput:
+    """An output of the state alone."""
+    return EpisodeOutput(
+        lambda environment, state, _: value(environment, state),
+        lambda environment, step, _: value(environment, step.state),
+    )
+
+
+def _success(environment: Environment, state: Any, before: Any) -> Any:
+    return jnp.asarray(environment.success(state, before), bool)
+
+
+def _observation(environment: Environment, state: Any) -> Any:
+    return jnp.asarray(environment.observe(state), jnp.float32)
+
+
+_REWARD = EpisodeOutput(
+    lambda environment, state, _: jnp.float32(0.0),
+    lambda environment, step, before: jnp.asarray(step.reward, jnp.float32),
+)
+OUTPUTS: Mapping[str, EpisodeOutput] = {
+    "success": EpisodeOutput(
+        lambda environment, state, _: _success(environment, state, jnp.array(False)),
+        lambda environment, step, before: _success(environment, step.state, before),
+    ),
+    "last_reward": _REWARD,
+    "first_observation": EpisodeOutput(
+        lambda environment, state, _: _observation(environment, state), lambda environment, step, before: before
+    ),
+    "last_observation": _of_state(_observation),
+    "observation": EpisodeOutput(
+        lambda environment, state, _: _observation(environment, state),
+        lambda environment, step, before: _observation(environment, step.before),
+    ),
+    "action": EpisodeOutput(
+        lambda environment, state, zeros_A: zeros_A,
+        lambda environment, step, before: jnp.asarray(step.action_A, jnp.float32),
+    ),
+    "reward": _REWARD,
+    "done": EpisodeOutput(
+        lambda environment, state, _: jnp.array(False),
+        lambda environment, step, before: jnp.asarray(step.done, bool),
+    ),
+    "step_descriptor": _of_state(lambda environment, state: jnp.asarray(environment.descriptor(state), jnp.float32)),
+}
+"""All outputs by name."""
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}
 
 
 class Carry(NamedTuple):
@@ -135,7 +220,7 @@ def episode_steps(
         else:
             action_A = action(jnp, spec.policy.output, outputs)
         state, reward, done = environment.step(carry.state, action_A)
-        step = Step(carry.state, action_A, state, reward, done)
+        step = EpisodeStep(carry.state, action_A, state, reward, done)
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
         returns = before.returns + reward

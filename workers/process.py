@@ -27,10 +27,9 @@ from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers import progress
-from workers.gpu import platform_of_gpu
 from workers.parents import Parents
 from workers.progress import Seen
-from workers.rollouts import BACKENDS
+from workers.rollouts import BACKENDS, platform_of_gpu
 from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here

@@ -26,8 +26,7 @@ from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
-from workers.policies.low_rank import act_low_rank
-from workers.policies.pairs import act_in_pairs
+from workers.policies.pairs import act_in_pairs, act_low_rank
 from workers.policies.policy import act, split_layers
 
 Policies = Callable[[Any, Any], tuple[Any, Any]]

@@ -12,7 +12,7 @@ from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue
 from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError, make_environment
-from workers.simd.frontend.digest import jaxpr_digest
+from workers.simd.frontend.trace import jaxpr_digest
 from workers.simd.graph.unsupported import UnsupportedError
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 import typer
 from rich.markdown import Markdown
 
-from es_service.cli.console import console, print_line
+from es_service.cli.printing import console, print_line
 from es_service.config.text import did_you_mean, nearest
 from es_service.errors import ConfigError
 

@@ -11,17 +11,8 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
-from es_service.cli.commands import command
-from es_service.cli.data import print_json
-from es_service.cli.options import (
-    ConfigArgument,
-    JsonOption,
-    SeedOption,
-    SetOption,
-    WorkersOption,
-    overrides,
-    print_note,
-)
+from es_service.cli.options import ConfigArgument, JsonOption, SeedOption, SetOption, WorkersOption, overrides
+from es_service.cli.printing import command, print_json, print_note
 from es_service.cli.sweep import GridOption, ParallelOption, SeedsOption, grid_of, seeds_of
 from es_service.config.given import parse_overrides, read_config
 from es_service.errors import ConfigError

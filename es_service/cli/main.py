@@ -22,7 +22,6 @@ import typer
 
 from es_service import api
 from es_service.cli.bench import bench
-from es_service.cli.console import console, print_line
 from es_service.cli.evaluate import evaluate
 from es_service.cli.guides import help_
 from es_service.cli.jobs import job_commands
@@ -41,16 +40,13 @@ from es_service.cli.options import (
     StrictOption,
     WorkersOption,
     overrides,
-    print_config_notes,
-    print_error,
 )
-from es_service.cli.polish import polish
-from es_service.cli.report import export, report
-from es_service.cli.session import session, told_to_user
+from es_service.cli.printing import console, print_config_notes, print_error, print_line
+from es_service.cli.report import export, report, watch
+from es_service.cli.session import polish, session, told_to_user
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.verify import verify
-from es_service.cli.watch import watch
 from es_service.config.changes import again_with
 from es_service.config.given import parse_overrides
 from es_service.config.workload import parallel_sentence
@@ -179,8 +175,7 @@ def doctor(
     as_json: JsonOption = False,
 ) -> None:
     """Check that this machine, a cluster or a task can run searches, and show what their results depend on."""
-    from es_service.cli.doctor import findings, print_findings
-    from es_service.cli.doctor_task import task_findings
+    from es_service.cli.doctor import findings, print_findings, task_findings
     from es_service.dispatch.cluster_findings import cluster_findings
 
     if not tasks:

@@ -1,25 +1,25 @@
-"""Options that several commands share, the config keys that they set, and the printing of notes, findings, errors."""
+"""Options that several commands share, and the config keys that they set.
+
+A command that takes several runs gets folders of runs or of sweeps, of which each run is read by itself, so that one
+that is damaged hides no other.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import typer
 
-from es_service.cli.commands import assignments, error_message
-from es_service.cli.console import console, errors, print_line
-from es_service.config.given import Source
-from es_service.config.model import RunConfig, implied_by
-from es_service.config.tasks import ROLLOUTS, task_of
-from es_service.config.text import show
-from es_service.config.workload import config_warnings
+from es_service.cli.printing import assignments, error_message, print_error, print_note
+from es_service.config.model import implied_by
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 from es_service.protocol.system import given_path
+from es_service.runs.folders import runs_of
+from es_service.store.folder import holds_run
 
 ConfigArgument = Annotated[
     Path, typer.Argument(parser=given_path, help="YAML file, or the name of a shipped config.", show_default=False)
@@ -104,49 +104,71 @@ def overrides(
     return [*assignments(implied_by(engine, address)), *(set_ or []), *assignments(options)]
 
 
-def print_note(message: str, style: str | None = None) -> None:
-    """Print a line that is not a result to stderr. If stderr is closed, rich raises SystemExit, which is ignored."""
-    with contextlib.suppress(SystemExit):
-        print_line(errors, message, style)
-
-
-def print_finding(level: str, text: str) -> None:
-    """Print a finding of `doctor`, whose level is "ok", "note" or "FAIL", on stdout."""
-    colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
-    console.print(f"{level:>4}", style=colour, end="  ")
-    print_line(console, text)
-
-
-def print_error(error: ServiceError | str) -> None:
-    """Print an error message and its ways out."""
-    message = error_message(error) if isinstance(error, ServiceError) else error
-    print_note(f"error: {message}", style="red")
-
-
-def print_config_notes(source: Source, configs: Sequence[RunConfig]) -> None:
-    """Print what a user should know before a run about configs made from `source` by overrides: ignored keys, values
-    that stay although another method has other defaults, and settings that are probably not intended. What several
-    configs have in common is printed once."""
-    notes: dict[str, None] = {}
-    for config in configs:
-        left_out = config.made.left_out
-        for why in dict.fromkeys(left_out.values()):
-            keys = [key for key in left_out if left_out[key] == why]
-            notes[f"ignored {', '.join(keys)} of {source}, since {why}"] = None
-        stays: dict[str, list[str]] = {}
-        for key, value in config.made.kept.items():
-            words = f"{key} = {show(value.value)} (by default {show(value.default)})"
-            stays.setdefault(value.why, []).append(words)
-        for why, words in stays.items():
-            notes[f"kept {', '.join(words)} of {source}, although {why}"] = None
-        notes |= dict.fromkeys(config_warnings(config, task_of(config), ROLLOUTS))
-    for note in notes:
-        print_note(f"note: {note}")
-
-
 def place_of(text: str, option: str = "--cell") -> tuple[int, ...]:
     """Place of a cell, parsed from text such as 3,17."""
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise ConfigError(f"{option} {text}: must be whole numbers separated by commas, such as 3,17") from None
+
+
+RunsArgument = Annotated[
+    list[Path],
+    typer.Argument(parser=given_path, metavar="RUN...", help="Folders of runs or of sweeps.", show_default=False),
+]
+T = TypeVar("T")
+
+
+def is_single(folders: Sequence[Path]) -> bool:
+    """Whether the folders of a command are one run; if not, its output names each run."""
+    return len(folders) == 1 and runs_of(folders[0]) == [folders[0]]
+
+
+def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tuple[Path, T | ServiceError | None]]:
+    """What is read of each run in some folders: (its folder, the result). The result is the error if a run cannot be
+    read, and None if it is one that its sweep has not started."""
+    return items_of_each(folders, lambda run: [read(run)])
+
+
+def items_of_each(
+    folders: Sequence[Path], read: Callable[[Path], Iterable[T]]
+) -> Iterator[tuple[Path, T | ServiceError | None]]:
+    """The same for several results of each run, each of which is passed on before the next is read."""
+    for folder in folders:
+        try:
+            runs = runs_of(folder)
+        except ServiceError as error:
+            yield folder, error
+            continue
+        for run in runs:
+            try:
+                waits = run != folder and not holds_run(run)
+                for result in [None] if waits else read(run):
+                    yield run, result
+            except ServiceError as error:
+                yield run, error
+
+
+def readable(
+    each: Iterable[tuple[Path, T | ServiceError | None]], problems: list[dict[str, str]]
+) -> Iterator[tuple[Path, T]]:
+    """The results of the runs that can be read. The others are named on stderr at once.
+
+    Args:
+        each: what `of_each` or `items_of_each` returns.
+        problems: gets what `--json` prints of each run that cannot be read.
+    """
+    for folder, result in each:
+        if result is None:
+            print_note(f"note: {folder} has not started")
+        elif isinstance(result, ServiceError):
+            message = error_message(result)
+            print_error(message if str(folder) in message else f"{folder}: {message}")
+            problems.append(problem_data(folder, result))
+        else:
+            yield folder, result
+
+
+def problem_data(folder: Path, error: ServiceError) -> dict[str, str]:
+    """What `--json` prints of a run that cannot be read."""
+    return {"run": str(folder), "error": error.sentence}

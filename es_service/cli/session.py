@@ -1,4 +1,4 @@
-"""A session of a run on the command line: its progress, its end, and its errors."""
+"""A session of a run on the command line: its progress, its end, and its errors; and the command `polish`."""
 
 from __future__ import annotations
 
@@ -6,17 +6,29 @@ import contextlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from es_service import api
-from es_service.cli.commands import command
-from es_service.cli.console import console, errors
-from es_service.cli.options import print_note
-from es_service.cli.tables.status import print_summary
+from es_service.cli.options import (
+    AddressOption,
+    EngineOption,
+    LogLevelOption,
+    LogOption,
+    OutOption,
+    RunArgument,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+    overrides,
+)
+from es_service.cli.printing import command, console, errors, print_line, print_note
+from es_service.cli.status import print_certified, print_summary
 from es_service.errors import Interrupted, ServiceError, WayOut
 from es_service.loop.history import Row
 from es_service.protocol.raised import users_error
-from es_service.report.progress import show_progress
+from es_service.report.progress import print_notice, show_progress
 from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
@@ -70,3 +82,33 @@ def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] |
     with contextlib.suppress(SystemExit):
         reason = outcome.reason if began else f"no generation was run, since {outcome.reason}"
         print_summary(console, outcome.run, reason)
+
+
+def polish(
+    parent: RunArgument,
+    candidates: Annotated[
+        int | None, typer.Option("--candidates", min=1, help="Policies that are left after the first evaluation.")
+    ] = None,
+    set_: SetOption = None,
+    out: OutOption = None,
+    seed: SeedOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
+    log: LogOption = None,
+    log_level: LogLevelOption = None,
+) -> None:
+    """Start a new run that improves policies of another one, and certify both; search.objective says what improves."""
+    from es_service.runs.polishing import certified_for, polish_config
+
+    chosen = [] if candidates is None else [f"search.candidates={candidates}"]
+    wanted = overrides([*chosen, *(set_ or ())], seed=seed, workers=workers, engine=engine, address=address)
+    config = polish_config(parent, wanted)
+    folder = out if out is not None else api.default_folder(config)
+    tell = partial(print_notice, errors)
+    before = certified_for(api.open_run(parent), config, tell, workers=workers)  # first: a driver may hold the parent
+    session(folder, partial(api.run, config, folder), log)
+    after = certified_for(api.open_run(folder), config, tell, workers=workers, centre=True)
+    for what, certified in (("before", before), ("after", after)):
+        print_line(console, f"certified {what} polishing:")
+        print_certified(console, certified)

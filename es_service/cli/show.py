@@ -1,33 +1,85 @@
-"""The commands that only read and print: `status`, `digest`, `config` and `list`."""
+"""The commands that only read and print: `status`, `digest`, `config` and `list`.
+
+`--json` prints the content of the tables as data.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.padding import Padding
+from rich.table import Table
 
 from es_service import api
-from es_service.cli.commands import command
-from es_service.cli.console import console, print_line
-from es_service.cli.data import catalogue_data, digest_data, print_json, status_data
-from es_service.cli.options import JsonOption, print_note
-from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, readable
-from es_service.cli.tables.catalogue import print_catalogue
-from es_service.cli.tables.overview import NOT_STARTED, print_overview
-from es_service.cli.tables.status import follow_status, print_status
-from es_service.config.given import shipped_text
+from es_service.cli.options import JsonOption, RunsArgument, is_single, of_each, problem_data, readable
+from es_service.cli.printing import command, console, print_json, print_line, print_note
+from es_service.cli.status import follow_status, print_status
+from es_service.config.given import first_sentence, shipped_configs, shipped_text
 from es_service.config.keys import unknown_key
+from es_service.config.search import PRESETS, preset_table
 from es_service.config.tasks import TASKS
-from es_service.config.text import one_of
+from es_service.config.text import one_of, show
 from es_service.config.values import described_keys
 from es_service.errors import ConfigError, ServiceError
+from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import Option, allowed_text
 from es_service.protocol.system import given_path
-from es_service.runs.folders import runs_of
-from es_service.runs.run_status import newest_runs, read_status
-from es_service.search.algorithms import OURS
+from es_service.report.progress import short
+from es_service.runs.folders import output_of, runs_of
+from es_service.runs.recent import Recent, read_recent
+from es_service.runs.run_status import RunStatus, newest_runs, read_status, state
+from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.store import digest
+from es_service.store.digest import digest_of
+
+
+def status_data(status: RunStatus) -> dict[str, Any]:
+    """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
+    that generation climb, and those of recent ones, or in `problem` why that is not known; `tries` has the mean fitness
+    of each policy that did not reach `target_certified` in new episodes."""
+    run, row = status.run, status.row
+    recent = read_recent(run, row["generation"]) if row else Recent()
+    return {
+        "run": str(run.folder),
+        "run_id": run.run_id,
+        "task": run.constants["task.environment"],
+        "algorithm": run.constants["search.algorithm"],
+        "seed": run.constants["seed"],
+        "state": state(status),
+        "driver": status.driver,
+        "last_end": status.end,
+        "limits": status.limits,
+        "target_certified": status.target_certified,
+        "tries": status.tries,
+        "newest": row,
+        "objectives": {
+            "newest": recent.newest and recent.newest._asdict(),
+            "recent": recent.objectives and recent.objectives._asdict(),
+            "problem": recent.problem,
+        },
+    }
+
+
+def digest_data(parts: Mapping[str, str], *, mixed: bool) -> dict[str, Any]:
+    """What `digest` shows of a run."""
+    return {"digest": digest_of(parts), "mixed": mixed, "parts": dict(parts)}
+
+
+def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
+    """What `list` shows: the shipped tasks, algorithms, presets and configs."""
+    return {
+        "tasks": [asdict(task) for task in tasks.values()],
+        "algorithms": list(ALGORITHMS),
+        "presets": [asdict(row) for row in preset_table(ALGORITHMS)],
+        "configs": list(shipped_configs()),
+    }
+
 
 NEWEST = 10
 """Most runs that `status` shows without a folder."""
@@ -144,3 +196,120 @@ def list_(as_json: JsonOption = False) -> None:
         print_json(catalogue_data(TASKS))
     else:
         print_catalogue(console, TASKS)
+
+
+def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
+    """Print tables of tasks, algorithms, the values of presets, and shipped configs."""
+    tasks = _table("tasks (task.environment)")
+    for task in known_tasks.values():
+        tasks.add_row(task.name, _about(task))
+    tasks.add_row("brax:NAME", "any environment of the installed Brax")
+    tasks.add_row("mujoco:ID", "an environment of Gymnasium by MJX, such as mujoco:Ant-v5")
+    tasks.add_row("gymnax:NAME", "an environment of gymnax 1.0, such as gymnax:CartPole-v1")
+    tasks.add_row("playground:NAME", "an environment of MuJoCo Playground 0.2, such as playground:CartpoleBalance")
+    tasks.add_row("gymnasium:ID", "an environment of Gymnasium, with Box or Discrete spaces")
+    tasks.add_row("module:Class", "a task of your own in JAX; see workers/README.md")
+    tasks.add_row("python:module:Class", "a task of your own in Python: an object with reset and step")
+    tasks.add_row("function:module:name", "a function of parameters of your own, without a policy")
+    console.print(tasks)
+
+    algorithms = _table("algorithms (search.algorithm)")
+    for name, method in ALGORITHMS.items():
+        algorithms.add_row(name, method.summary)
+    algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/method.py.")
+    console.print(algorithms)
+
+    presets = Table(
+        title="presets (search.preset): what they fill in where a config leaves it out", title_justify="left"
+    )
+    presets.add_column("key")
+    for name in PRESETS:
+        presets.add_column(name)
+    for row in preset_table(ALGORITHMS):
+        key = row.key if row.method is None else f"{row.key} of {row.method}"
+        presets.add_row(key, *(_value(getattr(row, name)) for name in PRESETS))
+    console.print(presets)
+
+    configs = _table("configs (es-service run NAME, es-service config NAME)")
+    for name, file in shipped_configs().items():
+        configs.add_row(name, first_sentence(file.read_text()))
+    console.print(configs)
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("name", no_wrap=True)
+    table.add_column("description")
+    return table
+
+
+def _about(task: TaskSpec) -> str:
+    bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
+    lines = [
+        task.summary,
+        f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
+        "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+        *([f"success: {task.success}"] if task.success else []),
+        *(f"option {name}: {_option(option)}" for name, option in task.options.items()),
+    ]
+    return "\n".join(lines)
+
+
+def _option(option: Option) -> str:
+    """What a config may set, the default first."""
+    if option.choices:
+        return " | ".join(map(show, option.choices))
+    return f"{show(option.default)} ({allowed_text(option, show)})"
+
+
+def _value(value: object) -> str:
+    """A value as written in a config."""
+    return f"{value:g}" if isinstance(value, float) else show(value)
+
+
+_COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
+NOT_STARTED = "not started"
+"""State of a sweep's run that has no folder yet."""
+
+
+def print_overview(console: Console, folders: Sequence[Path]) -> bool:
+    """Print a line for each run, with the error if it cannot be read; return whether all could be read.
+
+    Args:
+        folders: those of runs or of sweeps.
+    """
+    rows, problems = [], 0
+    for folder, result in of_each(folders, lambda run: _row(read_status(open_run(run)))):
+        if isinstance(result, ServiceError):
+            rows.append(_without_row(folder, f"error: {' '.join(result.sentence.split())}"))
+            problems += 1
+        elif result is None:
+            output = output_of(folder)
+            rows.append(_without_row(folder, NOT_STARTED + (f"; its output is in {output}" if output else "")))
+        else:
+            rows.append(result)
+    widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
+    for row in (_COLUMNS, *rows):
+        line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        print_line(console, line)
+    return not problems
+
+
+def _without_row(folder: Path, state: str) -> tuple[str, ...]:
+    return (str(folder), *["-"] * (len(_COLUMNS) - 2), state)
+
+
+def _row(status: RunStatus) -> tuple[str, ...]:
+    constants, limits, row = status.run.constants, status.limits, status.row
+    who = (str(status.run.folder), constants["search.algorithm"], constants["task.environment"], str(constants["seed"]))
+    if row is None:
+        return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(status))
+    generations, steps = limits.get("generations"), limits.get("env_steps")
+    return (
+        *who,
+        f"{row['generation']:,}" + (f" of {generations:,}" if generations else ""),
+        short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
+        f"{row['best_fitness']:.2f}",
+        f"{row['map_cells']:,}" if "map_cells" in row else "-",
+        state(status),
+    )

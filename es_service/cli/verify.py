@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from es_service import api
-from es_service.cli.console import console, print_line
-from es_service.cli.data import print_json
-from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, RunArgument
+from es_service.cli.printing import console, print_error, print_json, print_line, print_note
 from es_service.errors import RunLockedError
 from es_service.runs.checked_config import changed_config
 from es_service.runs.repeating import why_not_repeatable

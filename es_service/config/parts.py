@@ -1,7 +1,7 @@
 """Building blocks of a config: types annotated with the values allowed, in words, and the parts of a search.
 
 A part is chosen by its `kind`, which is a class here whose other fields are its keys: the step, the shaping, the noise,
-the elites, and what members are ranked by (objectives). Each kind has a function in `search/steps/`,
+the elites, and what members are ranked by (objectives). Each kind has a function in `search/steps.py`,
 `search/shaping.py`, `search/objectives.py` or `search/maps/`.
 """
 

@@ -11,9 +11,9 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, modes_of, require_mode
-from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
+from es_service.environments.vector import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
-from workers.lanes import Lanes, LanesState, Seen
+from workers.lanes import LaneResults, Lanes, LanesState
 
 _FIRST = np.zeros(1, np.intp)
 
@@ -115,6 +115,6 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if not self._is_seeded:
             raise ResetNeeded(f"call reset before {before}")
 
-    def _info(self, seen: Seen) -> dict[str, Any]:
+    def _info(self, seen: LaneResults) -> dict[str, Any]:
         shown = {name: array[0] for name, array in info_of(self.task, seen).items()}
         return shown | {"success": bool(shown["success"])}

@@ -10,14 +10,44 @@ from typing import Any
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.environments.drawing import FRAMES_PER_SECOND, Trails, modes_of, require_mode
-from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue
-from workers.lanes import Lanes, LanesState, Seen
+from workers.lanes import LaneResults, Lanes, LanesState
+
+
+def observation_space(task: TaskSpec) -> Box:
+    """Observations have no bounds."""
+    return Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+
+
+def action_space(task: TaskSpec) -> Box:
+    """Each number of an action is from -1 to 1."""
+    return Box(-1.0, 1.0, (task.action_size,), np.float32)
+
+
+def info_of(task: TaskSpec, seen: LaneResults) -> dict[str, Any]:
+    """The entries of `info`, with the axes of what is seen."""
+    distance = {"goal_distance": seen.goal_distance} if task.has_goal else {}
+    return {"descriptor": seen.descriptor, "success": seen.success} | distance
+
+
+def seed_given(seed: int) -> int:
+    """A seed that a caller gives. Raises ValueError if it is negative or has more than 63 bits."""
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed = {seed}; must be from 0 to 2**63 - 1")
+    return seed
+
+
+def random_seed() -> int:
+    """A seed for an environment that was given none."""
+    return int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
 
 Returned = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
@@ -153,7 +183,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             reward_N[lane_M], terminated_N[lane_M], truncated_N[lane_M] = 0.0, False, False
         elif self.autoreset_mode == AutoresetMode.SAME_STEP and (terminated_N | truncated_N).any():
             lane_M = np.flatnonzero(terminated_N | truncated_N)
-            last = Seen(*(array[lane_M] for array in seen))
+            last = LaneResults(*(array[lane_M] for array in seen))
             final_obs = np.full(self.num_envs, None, object)
             for lane in lane_M.tolist():
                 final_obs[lane] = seen.observation[lane].copy()
@@ -206,7 +236,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._is_seeded_N.all():
             raise ResetNeeded(f"call reset before {before}")
 
-    def _begin(self, lane_M: NDArray[np.intp]) -> Seen:
+    def _begin(self, lane_M: NDArray[np.intp]) -> LaneResults:
         """Reset some environments; returns what is seen in these."""
         seen = self._lanes.reset(lane_M)
         self._observation_N_O[lane_M] = seen.observation
@@ -218,11 +248,11 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
     def _returned(self) -> NDArray[np.float32]:
         return self._observation_N_O.copy() if self._copies else self._observation_N_O
 
-    def _put(self, shown: dict[str, NDArray], seen: Seen, lane_M: NDArray[np.intp]) -> None:
+    def _put(self, shown: dict[str, NDArray], seen: LaneResults, lane_M: NDArray[np.intp]) -> None:
         for name, array in info_of(self.task, seen).items():
             shown[name][lane_M] = array
 
-    def _info(self, seen: Seen, lane_M: NDArray[np.intp]) -> dict[str, Any]:
+    def _info(self, seen: LaneResults, lane_M: NDArray[np.intp]) -> dict[str, Any]:
         """The info of some environments, as Gymnasium has it: zeros for the others, and a mask for each name."""
         shown = {}
         for name, array in info_of(self.task, seen).items():

@@ -24,8 +24,7 @@ from es_service.protocol.evaluator import Requests
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain
 from es_service.search.algorithms.base import PolicyAsk, SearchState
-from es_service.search.maps.batches import insert_each
-from es_service.search.maps.behaviour_map import empty_map, map_statistics
+from es_service.search.maps.behaviour_map import empty_map, insert_each, map_statistics
 
 ELITES_AT_ONCE = 256
 """Elites that are evaluated side by side, so that the policies of large maps need not be in memory together. It is part

@@ -19,7 +19,7 @@ from es_service.protocol.episodes import joined
 from es_service.protocol.messages import Centre, EpisodesResult, PolicySpec, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk
 from es_service.search.maps.behaviour_map import EMPTY
-from es_service.search.steps.clipup import norm
+from es_service.search.steps import norm
 
 _Evaluated = tuple[Centre | PolicyWork, EpisodesResult, Mapping[str, Any]]
 """A centre or an ask for policies, its results [N, E], and its columns [N] by name, of which a single number is that of

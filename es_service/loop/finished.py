@@ -32,7 +32,7 @@ from es_service.search.algorithms.base import CentreEvaluations, SearchState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.maps.geometry import reachable_cells
 from es_service.search.observation_statistics import merge_moments
-from es_service.search.steps.clipup import norm
+from es_service.search.steps import norm
 
 Reachable = NDArray[np.bool_] | None
 """Whether each cell of the map can be reached, [cells]; None if this is unknown."""

@@ -48,7 +48,7 @@ from es_service.search.algorithms.base import (
 from es_service.search.algorithms.common import first_state
 from es_service.search.maps.behaviour_map import empty_map, with_names
 from es_service.search.maps.geometry import make_geometry
-from es_service.search.steps.clipup import norm
+from es_service.search.steps import norm
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
 

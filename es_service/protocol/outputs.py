@@ -1,4 +1,4 @@
-"""Names of the outputs of episodes that are computed only where a run names them; `workers/outputs.py` defines them.
+"""Names of the outputs of episodes that are computed only where a run names them; `workers/episode.py` defines them.
 
 Each is a named array of a result, beside those that every result has.
 """

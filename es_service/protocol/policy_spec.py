@@ -22,7 +22,7 @@ class PolicySpec:
     activation: Activation = "tanh"
     """Function after each hidden layer."""
     output: Output = "tanh"
-    """What makes an action of the last layer; see `workers.policies.outputs`."""
+    """What makes an action of the last layer; see `workers.policies.policy`."""
     bias: bool = True
     """Whether the layers have biases."""
     memory: int = 0

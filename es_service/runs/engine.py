@@ -31,7 +31,7 @@ from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.worker_count import work_at_once, worker_count
 from workers.actor import WorkerActor
-from workers.host.described import described
+from workers.asked_rows import described
 from workers.rollouts import BACKENDS
 from workers.simd.backend.cache import cache_folder
 

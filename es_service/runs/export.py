@@ -95,7 +95,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
     `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters` [N, D],
     `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer
-    after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`). If the task is
+    after layer; those of a memory are of its gates and its candidate (`workers/policies/policy.py`). If the task is
     a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
     snapshot = run.at(named=named_by_all)

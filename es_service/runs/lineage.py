@@ -38,8 +38,8 @@ from es_service.runs.snapshot import Policy, Snapshot, make_policy
 from es_service.runs.view import Run, named_best, named_by_all, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreState, FitnessWeight, SearchState
+from es_service.search.algorithms.common import elite_novelty
 from es_service.search.algorithms.measured import without_scores
-from es_service.search.algorithms.starts import elite_novelty
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.novelty import sound_archive
 from es_service.search.observation_statistics import no_observations

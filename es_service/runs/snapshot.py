@@ -24,9 +24,7 @@ from es_service.search.maps.geometry import Grid
 from es_service.search.novelty import NoveltyArchive
 from es_service.store import reader
 from es_service.store.schema import RunMeta
-from workers.policies.outputs import action
-from workers.policies.policy import act, initial_memory, normalise, split_layers
-from workers.policies.recurrent import dense_of_each
+from workers.policies.policy import act, action, dense_of_each, initial_memory, normalise, split_layers
 
 if TYPE_CHECKING:
     import pandas as pd

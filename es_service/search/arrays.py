@@ -14,31 +14,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.content import NAME
 
-Key = TypeVar("Key")
-Value = TypeVar("Value")
 _NUMERIC_KINDS = "biufc"
 _RESERVED = "/#"
 """Characters of the names of stored arrays, which no name of a search may have."""
 
 
-class ReadOnly(Mapping[Key, Value], Generic[Key, Value]):
+class ReadOnly(Mapping[str, Any]):
     """A mapping that cannot be changed."""
 
-    def __init__(self, content: Mapping[Key, Value]) -> None:
+    def __init__(self, content: Mapping[str, Any]) -> None:
         """A mapping with the present content of another one."""
         self._content = dict(content)
 
-    def __getitem__(self, key: Key) -> Value:
+    def __getitem__(self, key: str) -> Any:
         return self._content[key]
 
-    def __iter__(self) -> Iterator[Key]:
+    def __iter__(self) -> Iterator[str]:
         return iter(self._content)
 
     def __len__(self) -> int:

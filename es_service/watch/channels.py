@@ -54,7 +54,7 @@ class Allowance:
         return 0.0 if first else max(self._free_s - now_s, 0.0)
 
 
-class Channel:
+class PageChannel:
     """A page that is drawn again and again while somebody looks at it."""
 
     def __init__(self, draw: Callable[[], Picture | None], on_end: Callable[[], object], allowance: Allowance) -> None:

@@ -1,9 +1,11 @@
-"""What the live pages show: the list of runs, one run, several compared. The sections are those of the reports."""
+"""What the live pages show: the list of runs, one run, several compared. The sections are those of the reports;
+and the newest numbers of all runs as text for Prometheus (`metrics`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,10 +17,11 @@ from es_service.report.maps import empty_pattern
 from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
+from es_service.runs.recent import FAULTS_OF, read_recent
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.run_status import state
 from es_service.watch.channels import Picture
-from es_service.watch.runs import Found, Reading, Runs, Summary
+from es_service.watch.runs import FoundRun, RunReading, Runs, RunSummary
 
 SECTION_OF = {"charts": "curves", "map": "map", "cloud": "centres"}
 """Data of the page's script -> the section that they belong to."""
@@ -72,11 +75,11 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
     return draw
 
 
-def _is_running(summary: Summary) -> bool:
+def _is_running(summary: RunSummary) -> bool:
     return summary.status is not None and summary.status.driver is not None
 
 
-def _cells(summary: Summary) -> list[Markup]:
+def _cells(summary: RunSummary) -> list[Markup]:
     """The cells of a row, each with the name of its column for narrow windows."""
     run, status = summary.found, summary.status
     box = tag("input", type="checkbox", name="run", value=run.key, aria_label=f"compare {run.name}")
@@ -106,7 +109,7 @@ def _short(value: float | None) -> str:
     return "" if value is None or not math.isfinite(value) else short(value)
 
 
-def draw_run(runs: Runs, run: Found, reading: Reading) -> Callable[[], Picture | None]:
+def draw_run(runs: Runs, run: FoundRun, reading: RunReading) -> Callable[[], Picture | None]:
     """What draws one run; what was seen of it remains if it is moved or deleted."""
     last, told = Picture(run.name, {}, {}), ""
 
@@ -150,7 +153,9 @@ def _run_picture(data: RunData, *, whole: bool) -> Picture:
     )
 
 
-def draw_comparison(readings: Sequence[tuple[Found, Reading]], keys: Sequence[str]) -> Callable[[], Picture | None]:
+def draw_comparison(
+    readings: Sequence[tuple[FoundRun, RunReading]], keys: Sequence[str]
+) -> Callable[[], Picture | None]:
     """What draws the comparison of runs; arguments as of `comparison_sections`."""
     drawn: Any = None
 
@@ -189,3 +194,79 @@ def _begun(data: RunData) -> bool:
 
 def _notice(*said: object) -> Markup:
     return tag("section", tag("p", *said, class_="problem", role="alert"), id="live")
+
+
+GAUGES = {
+    "generation": ("generation", "Newest committed generation."),
+    "env_steps": ("env_steps", "Environment steps until then."),
+    "steps_per_second": ("steps_per_second", "Environment steps a second of the newest generation."),
+    "best_fitness": ("best_fitness", "Highest mean fitness of an evaluated centre or policy: selected, not certified."),
+    "coverage": ("coverage", "Filled cells as a share of all cells."),
+    "workers": ("workers", "Workers of the newest generation."),
+}
+"""Metric -> history column, meaning."""
+OTHERS = {
+    "running": "Whether a driver is writing.",
+    "readable": "Whether the run can be read.",
+    "certified_fitness": "Mean fitness, in certified episodes, of the policy that the newest certification put first.",
+    "certified_elsewhere_fitness": "The same in the other task that the label elsewhere names.",
+    "certified_gap": "Mean fitness there minus that of the same policy in the task of the run.",
+    "lost_workers": f"Workers lost in the newest {FAULTS_OF} generations.",
+    "retries": f"Chunks sent again in the newest {FAULTS_OF} generations.",
+}
+PREFIX = "es_service_"
+
+
+def metrics(summaries: Iterable[RunSummary]) -> str:
+    """A gauge for each number of each run, labelled with the run, its task and its search."""
+    values: dict[str, list[str]] = {name: [] for name in (*GAUGES, *OTHERS)}
+    for summary in summaries:
+        labels = {"run": summary.found.name}
+        numbers = _values(summary)
+        if summary.status is not None:
+            constants = summary.status.run.constants
+            labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
+        lines = [(labels, numbers)]
+        lines += [
+            (labels | {"elsewhere": task}, _elsewhere(one.row(), summary)) for task, one in summary.elsewhere.items()
+        ]
+        for labelled, of in lines:
+            shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labelled.items())
+            for name, value in of.items():
+                if math.isfinite(value):
+                    values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
+    about = {name: text for name, (_, text) in GAUGES.items()} | OTHERS
+    return "".join(
+        f"# HELP {PREFIX}{name} {about[name]}\n# TYPE {PREFIX}{name} gauge\n{''.join(lines)}"
+        for name, lines in values.items()
+        if lines
+    )
+
+
+def _values(summary: RunSummary) -> Mapping[str, float]:
+    numbers: dict[str, float] = {"readable": float(summary.status is not None)}
+    if summary.status is None:
+        return numbers
+    row = summary.status.row
+    numbers["running"] = float(summary.status.driver is not None)
+    if summary.certified_fitness is not None:
+        numbers["certified_fitness"] = summary.certified_fitness
+    if row is not None:
+        numbers |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
+        try:
+            recent = read_recent(summary.status.run, int(row["generation"]))
+        except ServiceError:  # it was deleted meanwhile
+            return numbers
+        if recent.problem is None:
+            numbers |= {"lost_workers": float(recent.lost_workers), "retries": float(recent.retries)}
+    return numbers
+
+
+def _elsewhere(row: Mapping[str, Any], summary: RunSummary) -> Mapping[str, float]:
+    """The numbers of a policy that was certified in another task."""
+    columns = {"certified_elsewhere_fitness": "elsewhere", "certified_gap": "gap"}
+    return {name: row[f"{prefix}_{summary.measure}_mean"] for name, prefix in columns.items()}
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

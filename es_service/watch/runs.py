@@ -34,7 +34,7 @@ DEEPEST = 8
 FILES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", f"{DATABASE}-journal", COPY, CONFIG, LOCK)
 
 
-class Found(NamedTuple):
+class FoundRun(NamedTuple):
     """A run below a given folder."""
 
     key: str
@@ -44,10 +44,10 @@ class Found(NamedTuple):
     root: Path
 
 
-class Summary(NamedTuple):
+class RunSummary(NamedTuple):
     """What a list shows of a run."""
 
-    found: Found
+    found: FoundRun
     status: RunStatus | None
     certified: Certified | None
     elsewhere: Mapping[str, Certified]
@@ -74,10 +74,10 @@ class Runs:
 
     def __init__(self, roots: Sequence[Path]) -> None:
         self._roots = [root.absolute() for root in roots]
-        self._known: dict[str, Found] = {}
-        self._summaries: dict[str, tuple[Any, Summary]] = {}
+        self._known: dict[str, FoundRun] = {}
+        self._summaries: dict[str, tuple[Any, RunSummary]] = {}
 
-    def find(self) -> list[Found]:
+    def find(self) -> list[FoundRun]:
         """The runs that there are now, in the order of their names."""
         runs = {run.key: run for root in self._roots for run in _below(root)}
         self._known |= runs
@@ -85,22 +85,22 @@ class Runs:
         self._summaries = {key: before[key] for key in runs if key in before}
         return list(runs.values())
 
-    def get(self, key: str) -> Found | None:
+    def get(self, key: str) -> FoundRun | None:
         """A run that is there, or was there before; None if there is none of this key."""
         return self._known.get(key) or {run.key: run for run in self.find()}.get(key)
 
-    def summaries(self) -> list[Summary]:
+    def summaries(self) -> list[RunSummary]:
         """All runs; those whose files have not changed are not read again."""
         return [self._summary(run) for run in self.find()]
 
-    def _summary(self, run: Found) -> Summary:
+    def _summary(self, run: FoundRun) -> RunSummary:
         seen = seen_of(run.folder)
         before = self._summaries.get(run.key)
         if before is None or before[0] != seen:
             self._summaries[run.key] = before = seen, _summary(run)
         return before[1]
 
-    def moved(self, run_id: str, but: Found) -> Found | None:
+    def moved(self, run_id: str, but: FoundRun) -> FoundRun | None:
         """A run of this id in another folder."""
         for summary in self.summaries():
             if summary.found.key != but.key and summary.status is not None and summary.status.run.run_id == run_id:
@@ -108,10 +108,10 @@ class Runs:
         return None
 
 
-class Reading:
+class RunReading:
     """A run that is read again and again; each time, only what is new. Threads that do so at once wait for another."""
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: FoundRun) -> None:
         self._found, self._followed = found, followed(found.folder)
         self._seen: Any = None
         self._lock = threading.Lock()
@@ -149,7 +149,7 @@ def seen_of(folder: Path) -> Mapping[str, Any]:
     return files | {LOCK: lock_holder(folder)}
 
 
-def require_inside(run: Found) -> None:
+def require_inside(run: FoundRun) -> None:
     """Raise StoreError if the folder of a run, or one of its files, is a link out of the folder that was given."""
     for name in ("", *FILES):
         if leads_out(run.folder / name, run.root):
@@ -157,22 +157,22 @@ def require_inside(run: Found) -> None:
             raise StoreError(what, run=run.folder)
 
 
-def _summary(run: Found) -> Summary:
+def _summary(run: FoundRun) -> RunSummary:
     try:
         require_inside(run)
         status = read_status(open_run(run.folder))
         certified, elsewhere = newest_certified(run.folder), certified_elsewhere(run.folder)
     except ServiceError as error:
-        return Summary(run, None, None, {}, " ".join(error.sentence.split()))
-    return Summary(run, status, certified, elsewhere, "")
+        return RunSummary(run, None, None, {}, " ".join(error.sentence.split()))
+    return RunSummary(run, status, certified, elsewhere, "")
 
 
-def _below(root: Path) -> Iterator[Found]:
+def _below(root: Path) -> Iterator[FoundRun]:
     for folder in _run_folders(root, DEEPEST):
         key = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
         name = root.name if folder == root else str(Path(root.name) / folder.relative_to(root))
         # A name may be no UTF-8; then it is shown with question marks.
-        yield Found(key, os.fsencode(name).decode(errors="replace"), folder, root)
+        yield FoundRun(key, os.fsencode(name).decode(errors="replace"), folder, root)
 
 
 def _run_folders(folder: Path, deeper: int) -> Iterator[Path]:

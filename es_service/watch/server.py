@@ -1,6 +1,6 @@
 """The server of the live page: its addresses, and what answers each of them.
 
-Reading and drawing are done in threads, a replay by a child process of one more; one replay at a time.
+RunReading and drawing are done in threads, a replay by a child process of one more; one replay at a time.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from es_service.report.replays import replay_section
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.view import open_run
 from es_service.watch import pages
-from es_service.watch.channels import Allowance, Channel, Picture
+from es_service.watch.channels import Allowance, PageChannel, Picture
 from es_service.watch.guard import LOCAL, Guard
-from es_service.watch.metrics import metrics
-from es_service.watch.runs import Found, Reading, Runs, require_inside
+from es_service.watch.pages import metrics
+from es_service.watch.runs import FoundRun, RunReading, Runs, require_inside
 
 ASSETS = {
     "page.css": ("es_service.report", "text/css"),
@@ -57,9 +57,9 @@ class Site:
     def __init__(self, roots: Sequence[Path], evaluate: Callable[[Path], Evaluate], *, trusted: bool) -> None:
         """`evaluate`: what evaluates a policy of a run's folder, as text. `trusted`: see `replay_section`."""
         self._runs, self._evaluate, self._trusted = Runs(roots), evaluate, trusted
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, PageChannel] = {}
         self._allowance, self._recording = Allowance(), asyncio.Lock()
-        self._readings: dict[str, Reading] = {}
+        self._readings: dict[str, RunReading] = {}
         self._replays: dict[tuple[Any, ...], dict[str, Any]] = {}
 
     def app(self, token: str | None) -> Starlette:
@@ -104,7 +104,7 @@ class Site:
         if name not in self._channels:
             draw, reading = await self._drawer(request)
             if name not in self._channels:  # it may have been made meanwhile
-                self._channels[name] = Channel(draw, lambda: self._ended(name), self._allowance)
+                self._channels[name] = PageChannel(draw, lambda: self._ended(name), self._allowance)
                 if reading is not None:
                     self._readings[name] = reading
         return StreamingResponse(self._channels[name].stream(), media_type="text/event-stream")
@@ -113,22 +113,22 @@ class Site:
         del self._channels[name]
         self._readings.pop(name, None)
 
-    async def _drawer(self, request: Request) -> tuple[Callable[[], Picture | None], Reading | None]:
+    async def _drawer(self, request: Request) -> tuple[Callable[[], Picture | None], RunReading | None]:
         """What draws a page, and for the page of one run what reads it."""
         match request.path_params["page"].split("/"):
             case ["list"]:
                 return pages.draw_list(self._runs), None
             case ["run", key]:
                 run = await self._found(key)
-                reading = Reading(run)
+                reading = RunReading(run)
                 return pages.draw_run(self._runs, run, reading), reading
             case ["compare"]:
                 keys = list(dict.fromkeys(request.query_params.getlist("run")))[:MOST_COMPARED]
-                compared = [(run, Reading(run)) for run in [await self._found(key) for key in keys]]
+                compared = [(run, RunReading(run)) for run in [await self._found(key) for key in keys]]
                 return pages.draw_comparison(compared, request.query_params.getlist("group_by")), None
         raise HTTPException(404)
 
-    async def _found(self, key: str) -> Found:
+    async def _found(self, key: str) -> FoundRun:
         run = await _in(_READING, lambda: self._runs.get(key))
         if run is None:
             raise HTTPException(404, "there is no such run below the folders that are watched")
@@ -139,7 +139,7 @@ class Site:
         run, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
         return JSONResponse(await _answer(_READING, lambda: self._details(run, cell)))
 
-    def _details(self, run: Found, cell: int) -> dict[str, Any]:
+    def _details(self, run: FoundRun, cell: int) -> dict[str, Any]:
         data = self._data(run)
         if data.map is None or cell not in data.map.cell_N:
             raise HTTPException(404, "this cell is empty")
@@ -158,7 +158,7 @@ class Site:
                 return Response(status_code=409)
             return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(run, which)))
 
-    def _recorded(self, run: Found, which: str) -> dict[str, Any]:
+    def _recorded(self, run: FoundRun, which: str) -> dict[str, Any]:
         """The section of a replay, of "best", "certified" or the elite of a cell, and what its script needs."""
         data = self._data(run)
         named = {"best": data.best, CERTIFIED: data.certified and data.certified.number}
@@ -173,10 +173,10 @@ class Site:
             self._replays[name] = {"html": section["section"], "data": section["scripts"]}
         return self._replays[name]
 
-    def _data(self, run: Found) -> RunData:
+    def _data(self, run: FoundRun) -> RunData:
         """The run as an open page shows it, else as it is."""
         require_inside(run)
-        reading = self._readings.get(f"run/{run.key}") or Reading(run)
+        reading = self._readings.get(f"run/{run.key}") or RunReading(run)
         if reading.data is None:
             reading.update()
         assert reading.data is not None

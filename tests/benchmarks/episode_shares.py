@@ -32,9 +32,8 @@ from workers.episode import episode_steps
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, module
-from workers.simd.backend.machine_code import compile_object, load_object
+from workers.simd.backend.native import aligned, compile_object, load_object, words_of
 from workers.simd.backend.target import host_target
-from workers.simd.backend.words import aligned, words_of
 from workers.simd.episodes.check import check_resets
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.layout import plan

@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from es_service import api
-from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.cli.bench import bench_rollouts
 
 POINT_MAZE_SIZES = ((64, 500), (512, 150), (4096, 40))
 ANT_SIZES = ((64, 20), (5000, 1))

@@ -80,7 +80,7 @@ def measure(row: str, near: Path | None, sides: Sequence[str], folder: Path, all
 
     from tests import mujoco_models as models
     from workers.environments import mujoco_parts
-    from workers.simd.backend.words import aligned, pack
+    from workers.simd.backend.native import aligned, pack
     from workers.simd.episodes.kernel import compile_kernel
 
     example = rows()[row](near)

@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 
 from es_service import api
-from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.cli.bench import bench_rollouts
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.dispatch.cores import cores

@@ -30,7 +30,7 @@ from unittest import mock
 
 import numpy as np
 
-from es_service.cli.bench_rollouts import ANT_HIDDEN
+from es_service.cli.bench import ANT_HIDDEN
 from es_service.protocol.process_environment import worker_environment
 
 TASKS = ("ant_maze", "ant_trap", "point_maze", "brax:ant")
@@ -89,7 +89,7 @@ def sizes_of(name: str, playground: Path | None) -> dict:
 
     from tests.benchmarks.mujoco import rows
     from workers.simd.backend.emit import emit
-    from workers.simd.backend.machine_code import compile_object
+    from workers.simd.backend.native import compile_object
     from workers.simd.backend.target import host_target
     from workers.simd.frontend.trace import trace_jaxpr
 
@@ -172,9 +172,8 @@ def facts_of(task: str) -> dict:
 def peak() -> float:
     """GFLOP/s of independent fused operations, 24 in flight, on vectors of this machine's width."""
     from workers.simd.backend.emit import emit
-    from workers.simd.backend.machine_code import compile_object, load_object
+    from workers.simd.backend.native import aligned, compile_object, load_object
     from workers.simd.backend.target import host_target
-    from workers.simd.backend.words import aligned
     from workers.simd.graph.graph import Graph
 
     graph, trips, lanes = Graph(), 100_000, host_target().width

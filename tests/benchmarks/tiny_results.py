@@ -24,7 +24,7 @@ import numpy as np
 
 from tests.workers.simd.rollouts import arguments, task_spec
 from workers.environments import make_environment
-from workers.simd.backend import machine_code, native
+from workers.simd.backend import native
 from workers.simd.backend.target import Target, host_target
 from workers.simd.episodes.compiled import compile_episodes
 
@@ -65,7 +65,7 @@ def measure(task: str, pairs: int, sigma: float) -> dict[str, float]:
     environment, target, places = make_environment(task, {}), host_target(), []
 
     def load(code: bytes, target: Target) -> tuple[int, object]:
-        jit = llvm.create_lljit_compiler(machine_code.code_generator(target), use_jit_link=True, suppress_errors=True)
+        jit = llvm.create_lljit_compiler(native.code_generator(target), use_jit_link=True, suppress_errors=True)
         library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol("kernel").export_symbol("counts")
         linked = library.link(jit, "kernels")
         places.append(ctypes.CFUNCTYPE(ctypes.c_void_p)(linked["counts"])())
@@ -74,9 +74,7 @@ def measure(task: str, pairs: int, sigma: float) -> dict[str, float]:
     centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec, sigma=sigma)
     with (
         mock.patch.object(native, "load_object", load),
-        mock.patch.object(
-            native, "compile_object", lambda text, target: machine_code.compile_object(counted(text), target)
-        ),
+        mock.patch.object(native, "compile_object", lambda text, target: native.compile_object(counted(text), target)),
         mock.patch.object(native.cache, "cache_folder", return_value=None),
     ):
         kernel = compile_episodes(environment, worker_spec, np.arange(len(mean_O)), training=True, target=target)

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from es_service.cli import bench_rollouts
+from es_service.cli import bench
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.child import Child
 
@@ -30,7 +30,7 @@ def test_nobody_goes_on_measuring_after_a_failure_or_a_signal(monkeypatch, modul
         started.append(Child(modules[len(started)], environment))
         return started[-1]
 
-    monkeypatch.setattr(bench_rollouts, "Child", start)
+    monkeypatch.setattr(bench, "Child", start)
     before = signal.signal(signal.SIGTERM, interrupt)
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM))
     if FAILS not in modules:
@@ -38,7 +38,7 @@ def test_nobody_goes_on_measuring_after_a_failure_or_a_signal(monkeypatch, modul
     began = time.monotonic()
     try:
         with pytest.raises((EvaluationError, Interrupted)):
-            bench_rollouts._row({"task": "point_maze"}, 2)
+            bench._row({"task": "point_maze"}, 2)
         assert [child.is_ended for child in started] == [True, True]
         assert time.monotonic() - began < 30
     finally:

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from es_service.api import load_config
-from es_service.cli import bench_rollouts, doctor
+from es_service.cli import bench, doctor
 from es_service.dispatch import cores
 from es_service.runs.worker_count import worker_count
 
@@ -103,6 +103,6 @@ def test_whoever_counts_cores_knows_of_the_quota(write, monkeypatch):
     assert worker_count(load_config(SMALLEST)) == 3
     assert next(doctor._machine())[1].startswith("3 of ")
     asked = []
-    monkeypatch.setattr(bench_rollouts, "_row", lambda arguments, count: asked.append(count) or {})
-    list(bench_rollouts.bench_rollouts(["point_maze"], policies=[True], rollouts=["xla"]))
+    monkeypatch.setattr(bench, "_row", lambda arguments, count: asked.append(count) or {})
+    list(bench.bench_rollouts(["point_maze"], policies=[True], rollouts=["xla"]))
     assert asked == [1, 3]

@@ -3,7 +3,7 @@
 import pytest
 
 from es_service import api
-from es_service.cli.tables.evaluations import row_of
+from es_service.cli.evaluate import row_of
 from es_service.runs.evaluation import candidates, evaluate
 from tests.examples.fourier import Fourier
 from workers.environments import TaskError, declared, user_task

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from es_service import api
-from es_service.cli.doctor_task import task_findings
+from es_service.cli.doctor import task_findings
 from es_service.cli.main import app
 from es_service.errors import ConfigError
 from es_service.protocol.noise import uniforms
@@ -28,7 +28,7 @@ def findings(name):
     [(f"python:{MODULE}:Drift", "steps"), ("function:tests.workers.functions:hill", "calls")],
 )
 def test_a_task_that_repeats_is_said_to(name, unit, monkeypatch):
-    monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
+    monkeypatch.setattr("es_service.cli.doctor.SECONDS", 0.01)
     (_, what), _, (level, repeats), (_, speed) = findings(name)
     assert what.startswith(f"{name}: A ")
     assert level == "ok"
@@ -87,7 +87,7 @@ def test_what_simd_would_hide_is_a_failure_and_refused_before_a_run():
 
 @pytest.mark.slow
 def test_tasks_that_do_not_repeat_are_told_from_one_that_does_with_what_mends_it(monkeypatch):
-    monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
+    monkeypatch.setattr("es_service.cli.doctor.SECONDS", 0.01)
     forgetful, fragile = (f"python:{MODULE}:{name}" for name in ("Forgetful", "Fragile"))
     *_, (level, repeats), (_, mended), _ = findings(forgetful)
     assert level == "note"

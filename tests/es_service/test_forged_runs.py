@@ -26,9 +26,8 @@ from es_service.runs.certification import certify_run
 from es_service.runs.evaluation import candidates
 from es_service.runs.lineage import started
 from es_service.runs.verification import verify
-from es_service.watch.metrics import metrics
-from es_service.watch.pages import draw_comparison, draw_list, draw_run
-from es_service.watch.runs import Reading, Runs
+from es_service.watch.pages import draw_comparison, draw_list, draw_run, metrics
+from es_service.watch.runs import RunReading, Runs
 from tests.es_service.forgeries import forge
 
 LONGEST_S = 10.0
@@ -74,7 +73,7 @@ def list_of_all(folder: Path) -> None:
 def live(folder: Path) -> None:
     runs = Runs([folder.parent])
     found = {one.folder.name: one for one in runs.find()}
-    reading, other = Reading(found[folder.name]), Reading(found[OTHER])
+    reading, other = RunReading(found[folder.name]), RunReading(found[OTHER])
     draw_run(runs, found[folder.name], reading)()
     draw_comparison([(found[folder.name], reading), (found[OTHER], other)], [])()
 

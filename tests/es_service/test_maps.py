@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.search.maps.batches import insert_each
 from es_service.search.maps.behaviour_map import (
     EMPTY,
     changed,
     empty_map,
     insert,
+    insert_each,
     map_statistics,
     moved,
     removed,

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from es_service import api, write_report
-from es_service.cli.console import text_console
-from es_service.cli.tables.status import print_status, print_summary
+from es_service.cli.printing import text_console
+from es_service.cli.status import print_status, print_summary
 from es_service.errors import ConfigError
 from es_service.runs.export import export
 from es_service.runs.verification import verify

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from es_service import api, open_run
+from es_service.cli.evaluate import csv_file
 from es_service.cli.main import app
-from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
 from es_service.runs import evaluation
 from es_service.runs.folders import runs_of

@@ -90,7 +90,7 @@ def test_an_unchanged_checkout_at_another_path_has_the_same_code(elsewhere):
     [
         ("workers/simd/graph/folding.py", True),
         ("es_service/protocol/noise.py", True),
-        ("es_service/search/steps/adam.py", False),
+        ("es_service/search/steps.py", False),
         ("es_service/loop/driver.py", False),
         ("es_service/config/search.py", False),
     ],

@@ -15,12 +15,11 @@ import pytest
 from typer.testing import CliRunner
 
 from es_service import api
-from es_service.cli.commands import settings
-from es_service.cli.console import text_console
+from es_service.cli import status
 from es_service.cli.main import app
-from es_service.cli.tables import status
-from es_service.cli.tables.overview import print_overview
-from es_service.cli.tables.status import follow_status, print_status, print_summary
+from es_service.cli.printing import settings, text_console
+from es_service.cli.show import print_overview
+from es_service.cli.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
 from es_service.report.data import read_run

@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli.main import app
-from es_service.cli.sweep import grid_of, seeds_of, steps_of
-from es_service.cli.tables.sweep import live_table
+from es_service.cli.sweep import grid_of, live_table, seeds_of, steps_of
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError

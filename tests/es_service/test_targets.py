@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.cli.console import text_console
-from es_service.cli.data import status_data
-from es_service.cli.tables.status import print_status, print_summary
+from es_service.cli.printing import text_console
+from es_service.cli.show import status_data
+from es_service.cli.status import print_status, print_summary
 from es_service.protocol.noise import Domain
 from es_service.report.data import read_run
 from es_service.report.facts import what_was_run

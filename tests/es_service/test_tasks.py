@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.cli.bench import bench_rollouts
 from es_service.config.tasks import TASKS, task_of
 from es_service.config.workload import config_warnings
 from es_service.dispatch.events import Limits

@@ -26,7 +26,7 @@ from es_service.store.codec import text_sha256
 from es_service.store.lock import acquire_lock
 from es_service.watch import channels
 from es_service.watch.pages import draw_list, draw_run
-from es_service.watch.runs import Reading, Runs
+from es_service.watch.runs import RunReading, Runs
 from es_service.watch.server import Site
 from tests.database import database, execute
 from tests.es_service.test_report_page import Elements
@@ -116,7 +116,7 @@ def test_runs_are_found_at_any_depth_and_links_lead_nowhere(tmp_path):
         assert "is a link that leads out of" in found[name]
         one = next(one for one in Runs([root]).find() if one.name == name)
         with pytest.raises(StoreError, match="leads out of"):
-            Reading(one).update()
+            RunReading(one).update()
     (tmp_path / "given").symlink_to(root)  # a folder that is given may be a link
     assert [one.problem for one in Runs([tmp_path / "given"]).summaries()][:1] == [""]
 
@@ -147,7 +147,7 @@ def test_reading_what_is_new_equals_reading_all_also_after_a_fall_back(tmp_path,
 
     def after(row):
         nonlocal reading
-        reading = reading or Reading(Runs([root]).find()[0])
+        reading = reading or RunReading(Runs([root]).find()[0])
         compare()
         seen.append(reading.data.last("generation"))
         if row["generation"] == 3:
@@ -173,7 +173,7 @@ def test_reading_what_is_new_equals_reading_all_also_after_a_fall_back(tmp_path,
 def test_threads_that_read_a_run_at_once_read_each_generation_once(tmp_path, monkeypatch):
     monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 100)
     folder = write_run(tmp_path / "runs/a", generations=2000)
-    reading = Reading(Runs([tmp_path / "runs"]).find()[0])
+    reading = RunReading(Runs([tmp_path / "runs"]).find()[0])
     with ThreadPoolExecutor(4) as threads:
         while not reading.whole:
             list(threads.map(lambda _: reading.update(), range(4)))
@@ -187,7 +187,7 @@ def test_a_damaged_run_shows_what_is_left(tmp_path):
     middle = content.index(sha256.encode())
     content[middle - 400 : middle + 40] = bytes(440)
     (folder / "run.db").write_bytes(content)
-    reading = Reading(Runs([tmp_path]).find()[0])
+    reading = RunReading(Runs([tmp_path]).find()[0])
     whole = read_run(folder, paths=False, digest=False)
     while reading.update():
         pass
@@ -224,7 +224,7 @@ def test_a_cell_has_its_path_and_its_command(tmp_path):
 def test_what_was_seen_stays_when_a_run_is_moved_or_deleted(tmp_path):
     folder, runs = write_run(tmp_path / "a"), Runs([tmp_path])
     one = runs.find()[0]
-    draw = draw_run(runs, one, Reading(one))
+    draw = draw_run(runs, one, RunReading(one))
 
     def drawn():
         picture = draw()
@@ -368,7 +368,7 @@ def test_the_certified_fitness_is_in_the_unit_of_the_fitness_beside_it(tmp_path,
     shown = f"{number(row['last_reward_mean'])} (best of generation {row['generation']})"
     assert f'data-head="certified">{shown}<' in listed
     [found] = runs.find()
-    page = str(draw_run(runs, found, Reading(found))().sections["what"])
+    page = str(draw_run(runs, found, RunReading(found))().sections["what"])
     assert f"The certified policy, best of generation {row['generation']}, has" in page
     assert f"has a mean last reward of {number(row['last_reward_mean'])} (" in page
 
@@ -393,7 +393,7 @@ def test_one_picture_is_drawn_for_all_viewers_and_only_what_changed_is_sent(monk
         return found
 
     async def watched():
-        channel = channels.Channel(draw, lambda: ended.append(1), channels.Allowance())
+        channel = channels.PageChannel(draw, lambda: ended.append(1), channels.Allowance())
         found = await asyncio.gather(*(viewer(channel) for _ in range(20)))
         monkeypatch.setattr(channels, "LINGER_S", 0.0)
         await channel._task
@@ -420,7 +420,7 @@ def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
     monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 3)
     folder = write_run(tmp_path / "a", generations=20)
     execute(folder, "UPDATE history SET sha256 = '' WHERE generation BETWEEN 5 AND 9")
-    reading = Reading(Runs([tmp_path]).find()[0])
+    reading = RunReading(Runs([tmp_path]).find()[0])
     for _ in range(30):
         reading.update()
     assert reading.whole
@@ -484,7 +484,7 @@ def test_on_a_shared_file_system_the_copy_is_watched_while_a_driver_writes(tmp_p
             return
         read.clear()
         [one] = Runs([tmp_path]).summaries()
-        reading = Reading(one.found)
+        reading = RunReading(one.found)
         assert reading.update()
         assert reading.data is not None
         assert not reading.data.problems

@@ -37,7 +37,7 @@ POLICIES = {
     "es_service.loop.state.Best": "the best centre, with its fitness",
     "es_service.runs.snapshot.Policy": "public: what `open_run(...).policy` returns, which acts",
     "es_service.runs.certified.Certified": "as stored with its certification",
-    "workers.asking.Rows": "a row for each episode that a caller computes",
+    "workers.asked_rows.Rows": "a row for each episode that a caller computes",
 }
 """Classes with parameters, and with means and standard deviations of observations."""
 

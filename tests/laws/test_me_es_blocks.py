@@ -8,9 +8,8 @@ import pytest
 from es_service.protocol.content import NAME
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
-from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map
+from es_service.search.algorithms.common import add_to_archive, elite_novelty, first_state, insert_into_map
 from es_service.search.algorithms.me_es import cell_shares
-from es_service.search.algorithms.starts import elite_novelty
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.maps.geometry import Grid
 from es_service.search.novelty import empty_archive, extended

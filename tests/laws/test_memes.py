@@ -18,9 +18,8 @@ from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
-from es_service.search.algorithms.common import first_state
+from es_service.search.algorithms.common import TRIED, Starts, drawn_cell, first_state, start_shares
 from es_service.search.algorithms.memes import AGE, RESET_CHOICE, STAGNANT
-from es_service.search.algorithms.starts import TRIED, Starts, drawn_cell, start_shares
 from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.search.novelty import empty_archive, extended

@@ -38,8 +38,7 @@ from es_service.runs.replay import record
 from es_service.runs.selection import Episodes
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
-from es_service.watch.metrics import metrics
-from es_service.watch.pages import draw_list
+from es_service.watch.pages import draw_list, metrics
 from es_service.watch.runs import Runs
 from tests.database import database
 from tests.helpers import DirectEvaluator

@@ -14,8 +14,7 @@ from es_service.protocol.evaluator import completed
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import centred_ranks, pair_signs, pair_weights, shaped, standardised
-from es_service.search.steps.adam import adam_step, adamw_step, fresh_adam
-from es_service.search.steps.clipup import clipup_step, fresh_clipup
+from es_service.search.steps import adam_step, adamw_step, clipup_step, fresh_adam, fresh_clipup
 from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
 from tests.references import es as reference

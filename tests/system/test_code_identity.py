@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from es_service import api
-from es_service.cli.commands import command
+from es_service.cli.printing import command
 from es_service.errors import ConfigError
 from es_service.protocol.machine import CODE
 from es_service.protocol.sources import sha256
@@ -48,7 +48,7 @@ class Point:
 '''
 REWARD = "def reward(state):\n    return state[0]\n"
 SEARCH = """
-from es_service.search.algorithms.ns_es import ns_es
+from es_service.search.algorithms.nsra_es import ns_es
 
 def search(config):
     return ns_es(config)
@@ -109,7 +109,7 @@ LENGTH = """
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
-from es_service.search.algorithms.ns_es import ns_es
+from es_service.search.algorithms.nsra_es import ns_es
 from my_version import VERSION
 
 def search(config):

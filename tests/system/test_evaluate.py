@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from es_service.cli.tables.evaluations import csv_file
+from es_service.cli.evaluate import csv_file
 from es_service.errors import ConfigError, StoreError
 from tests.benchmarks import paper
 from tests.system.command_line import PROGRAM, command

@@ -18,8 +18,7 @@ from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.references import point_maze
 from workers.compilable import Compilable
-from workers.policies.outputs import action, drawn_action
-from workers.policies.policy import act, normalise, split_layers
+from workers.policies.policy import act, action, drawn_action, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 NO_JAX = """

@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 
 from es_service import api, load_config
-from es_service.cli.tables.status import print_status
+from es_service.cli.status import print_status
 from es_service.config.tasks import TASKS, task_of
 from es_service.config.workload import chunks_of_phases, policy_spec
 from es_service.errors import ConfigError, EvaluationError

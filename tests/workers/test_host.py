@@ -36,7 +36,7 @@ from tests.system.processes import is_running
 from tests.workers import host_tasks
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.environments.host_task import HostEnvironment, unchanged
-from workers.host.episodes import Lanes
+from workers.host.episodes import EnvironmentPool
 from workers.host.examine import examine
 from workers.host.policies import LanePolicies
 from workers.host.repeats import does_not_repeat
@@ -173,7 +173,7 @@ def test_members_are_the_centre_and_its_noise_with_the_action_noise_of_their_add
                 reset_key, action_key = stream_keys(
                     3, (Domain.TRAINING_RESET, Domain.ACTION_NOISE), 5, 4 + p, 0, episode
                 )
-                ((_, environment),) = Lanes(make_host_task(DRIFT, {"wind": 0.05})).of([0])
+                ((_, environment),) = EnvironmentPool(make_host_task(DRIFT, {"wind": 0.05})).of([0])
                 policy = LanePolicies(
                     worker_spec, member_D[None], subject.observation_mean_O, subject.observation_std_O, action_key[None]
                 )

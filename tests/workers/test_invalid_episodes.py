@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.cli.doctor_task import task_findings
+from es_service.cli.doctor import task_findings
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import uniforms

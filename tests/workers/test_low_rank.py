@@ -15,10 +15,10 @@ from es_service.protocol.messages import EpisodesResult, GradientChunk, Gradient
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests import helpers
 from tests.helpers import centre, chunk_runner, random_parameters
-from workers.host.noise import gradient_summer, members
-from workers.policies.low_rank import act_low_rank
+from workers.host.policies import gradient_summer, members
+from workers.policies.pairs import act_low_rank
 from workers.policies.policy import act, initial_memory, initial_parameters, split_layers
-from workers.simd.episodes.low_rank_gradient import make_low_rank_gradient_sum
+from workers.simd.episodes.low_rank import make_low_rank_gradient_sum
 
 PAIRS, UNIT = 3, np.float32(0.05 / NORMAL_STD)
 POLICY = PolicySpec((5, 7, 4, 2))

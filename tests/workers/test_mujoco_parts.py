@@ -12,7 +12,7 @@ from tests import mujoco_models
 from workers.environments import TaskError, mujoco_parts
 from workers.environments.mujoco_parts import MjModel, mujoco
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.frontend.tracer import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
 BALLS = """<mujoco>

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.cli.doctor_task import step_findings
+from es_service.cli.doctor import step_findings
 from es_service.protocol.errors import TaskError
 from es_service.protocol.sources import modules_of, user_sources
 from workers.environments import describe_environment, make_environment

@@ -19,7 +19,7 @@ from tests.workers.steps import environment_of, resets_of
 from tests.workers.test_policies import bits, evaluate
 from workers import environments
 from workers.environments import SHIPPED, Environment
-from workers.outputs import OUTPUTS
+from workers.episode import OUTPUTS
 from workers.policies.policy import initial_parameters
 from workers.worker import episode_keys
 

@@ -19,7 +19,7 @@ from tests.helpers import PARAMETERS, SPEC, DirectEvaluator, centre, random_para
 from tests.workers.simd.rollouts import targets, task_spec
 from workers.environments import make_environment
 from workers.policies.policy import initial_parameters
-from workers.simd.backend.words import aligned
+from workers.simd.backend.native import aligned
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.worker import make_worker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service import api, load_config
-from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.cli.bench import bench_rollouts
 from es_service.config.workload import config_warnings
 from es_service.errors import ConfigError, EvaluationError
 from es_service.runs.replay import record

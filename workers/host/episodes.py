@@ -1,25 +1,105 @@
 """Episodes in lanes that step side by side, each with an environment of its own.
 
 Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
+
+OUTPUTS are computed only if a run names them; `es_service/protocol/outputs.py` has their names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import inf, isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
+from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
-from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import Episodes, FailedEpisode, observation_text, raised_in_lane
+
+
+class HostStep(NamedTuple):
+    """One step of an episode."""
+
+    environment: HostEnvironment
+    """The environment after the step."""
+    before_O: FloatArray
+    """Observation on which the policy acted."""
+    action_A: FloatArray
+    """Action of the policy, with its noise."""
+    observation_O: FloatArray
+    reward: float
+    done: bool
+
+
+class HostOutput(NamedTuple):
+    """An output as functions of a step. The result of an episode has the value of its last step, or of each one."""
+
+    size: Callable[[WorkerSpec, HostTask], tuple[int, ...]]
+    """Function from the run to the shape of the value."""
+    dtype: type
+    of: Callable[[HostStep], Any]
+
+
+def _scalar(spec: WorkerSpec, task: HostTask) -> tuple[int, ...]:
+    return ()
+
+
+def _observation(spec: WorkerSpec, task: HostTask) -> tuple[int, ...]:
+    return (task.observation_size,)
+
+
+OUTPUTS: Mapping[str, HostOutput] = {
+    "success": HostOutput(_scalar, bool, lambda step: step.environment.success()),
+    "last_reward": HostOutput(_scalar, np.float32, lambda step: step.reward),
+    "first_observation": HostOutput(_observation, np.float32, lambda step: step.environment.first_observation_O),
+    "last_observation": HostOutput(_observation, np.float32, lambda step: step.observation_O),
+    "observation": HostOutput(_observation, np.float32, lambda step: step.before_O),
+    "action": HostOutput(lambda spec, task: (spec.policy.widths[-1],), np.float32, lambda step: step.action_A),
+    "reward": HostOutput(_scalar, np.float32, lambda step: step.reward),
+    "done": HostOutput(_scalar, bool, lambda step: step.done),
+    "step_descriptor": HostOutput(
+        lambda spec, task: (task.descriptor_size,), np.float32, lambda step: step.environment.descriptor()
+    ),
+}
+"""All outputs by name."""
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}
+
+
+class Outputs:
+    """The outputs that a run names, of episodes in lanes; values of lanes that do not run, and after the end, are 0."""
+
+    def __init__(self, names: Sequence[str], spec: WorkerSpec, task: HostTask, lanes: int) -> None:
+        """Begin with values of 0. Raises ValueError for a name that no output has."""
+        if unknown := sorted({*names} - {*OUTPUTS}):
+            raise ValueError(f"no output of episodes has the name {unknown[0]!r}; choose among {', '.join(OUTPUTS)}")
+        self._named = {name: OUTPUTS[name] for name in names}
+
+        def zeros(name: str, *axes: int) -> Any:
+            return np.zeros((*axes, *OUTPUTS[name].size(spec, task)), OUTPUTS[name].dtype)
+
+        self.at_the_end = {name: zeros(name, lanes) for name in names if name not in OF_STEPS}
+        """[L, ...]"""
+        self.of_steps = {name: zeros(name, lanes, spec.episode_steps) for name in names if name in OF_STEPS}
+        """[L, T, ...]"""
+
+    def __bool__(self) -> bool:
+        return bool(self._named)
+
+    def note(self, lane: int, number: int, step: HostStep, *, is_last: bool) -> None:
+        """Keep the outputs of a step; steps are counted from 0."""
+        for name, kept in self.of_steps.items():
+            kept[lane, number] = self._named[name].of(step)
+        if is_last:
+            for name, kept in self.at_the_end.items():
+                kept[lane] = self._named[name].of(step)
+
 
 SHOWN = 4
 """Parameters of a policy that a message shows."""
@@ -33,7 +113,7 @@ class Watched(NamedTuple):
     returns: list[float]
 
 
-class Lanes:
+class EnvironmentPool:
     """The environments of a worker's lanes, made when they are first needed and used for one episode after another."""
 
     def __init__(self, task: HostTask) -> None:
@@ -49,7 +129,7 @@ class Lanes:
 
 
 def run_episodes(
-    lanes: Lanes,
+    lanes: EnvironmentPool,
     spec: WorkerSpec,
     parameters_L_D: FloatArray,
     mean: FloatArray,
@@ -130,7 +210,7 @@ def run_episodes(
                 progress.moved()
                 is_last = done or step == spec.episode_steps
                 if outputs:
-                    now = Step(environment, observation_L_O[lane], action_L_A[lane], seen_O, reward, done)
+                    now = HostStep(environment, observation_L_O[lane], action_L_A[lane], seen_O, reward, done)
                     outputs.note(lane, step - 1, now, is_last=is_last)
                 observation_L_O[lane] = seen_O
                 reward_L[lane], steps_L[lane] = reward, step

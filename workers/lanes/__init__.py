@@ -19,11 +19,10 @@ from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import OptionValue, allowed_text, allowed_value, option_values
 from workers.environments import SHIPPED, TaskError, describe_environment, is_function_task, is_host_task
-from workers.lanes.blocks import BLOCK, Blocks
+from workers.lanes.blocks import BLOCK, Blocks, LaneResults
 from workers.lanes.compiled import CompiledLanes, compiled_resets, kernels
-from workers.lanes.functions import Seen
 
-__all__ = ["Lanes", "LanesState", "Seen", "task_named"]
+__all__ = ["LaneResults", "Lanes", "LanesState", "task_named"]
 
 
 class LanesState(NamedTuple):
@@ -108,7 +107,7 @@ class Lanes:
         self.steps_N = np.zeros(lanes, np.int64)
         """Steps since the reset of each lane."""
 
-    def reset(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32] | None = None) -> Seen:
+    def reset(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32] | None = None) -> LaneResults:
         """Begin the next episode in some lanes, in increasing order; returns what is seen in these, [M].
 
         Args:
@@ -120,7 +119,7 @@ class Lanes:
             keys_M = stream_keys(0, Domain.ENVIRONMENT_RESET, 0, self.seed_N[lane_M], self.episode_N[lane_M])
         return self._lanes.begin(lane_M, keys_M)
 
-    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+    def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
         """Step all lanes; actions outside of [-1, 1] are clipped by the task."""
         self.steps_N += 1
         return self._lanes.step(action_N_A)

@@ -4,14 +4,17 @@ XLA may give other bits for another shape, another number of threads, or another
 in blocks of 16, padded, with one thread, and lane i is always in place i modulo 16 of its block: its bits depend on
 that and on its own state and action, and not on the number of lanes or processes. The settings are those of a process
 before it loads JAX, and the caller has loaded it in its own way.
+
+`lane_functions` are the reset and the step of one lane, which simd compiles and xla maps over blocks of lanes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +22,70 @@ from es_service.protocol.child import Child, NoAnswerError
 from es_service.protocol.options import OptionValue
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError
-from workers.environments import TaskError
-from workers.lanes.functions import Seen
+from workers.environments import Environment, TaskError
 from workers.xla_cache import xla_cache_settings
+
+
+class LaneResults(NamedTuple):
+    """Results of a reset or a step in each lane."""
+
+    observation: Any
+    """[N, O] float32, neither normalised nor clipped."""
+    reward: Any
+    """[N] float32; 0 after a reset."""
+    done: Any
+    """[N] bool: whether the task has ended the episode."""
+    descriptor: Any
+    """[N, B] float32, in the units of the task."""
+    goal_distance: Any
+    """[N] float32; NaN if the task has no goal."""
+    success: Any
+    """[N] bool: whether the episode would have succeeded if it ended here; False if the task does not say."""
+
+
+class LaneCarry(NamedTuple):
+    """State of a lane."""
+
+    state: Any
+    success: Any
+
+
+class LaneFunctions(NamedTuple):
+    """The functions of one lane."""
+
+    begin: Callable[[Any], tuple[LaneCarry, LaneResults]]
+    """Function of the stream key of a reset."""
+    step: Callable[[LaneCarry, Any], tuple[LaneCarry, LaneResults]]
+    """Function of a carry and an action [A]."""
+
+
+def lane_functions(environment: Environment) -> LaneFunctions:
+    """The functions of a lane of a task."""
+
+    def carried(state: Any, before: Any) -> LaneCarry:
+        return LaneCarry(state, jnp.asarray(environment.success(state, before), bool))
+
+    def seen(carry: LaneCarry, reward: Any, done: Any) -> LaneResults:
+        return LaneResults(
+            jnp.asarray(environment.observe(carry.state), jnp.float32),
+            jnp.asarray(reward, jnp.float32),
+            jnp.asarray(done, bool),
+            jnp.asarray(environment.descriptor(carry.state), jnp.float32),
+            jnp.asarray(environment.goal_distance(carry.state), jnp.float32),
+            carry.success,
+        )
+
+    def begin(key: Any) -> tuple[LaneCarry, LaneResults]:
+        carry = carried(environment.reset(key), jnp.array(False))
+        return carry, seen(carry, 0.0, False)
+
+    def step(carry: LaneCarry, action_A: Any) -> tuple[LaneCarry, LaneResults]:
+        state, reward, done = environment.step(carry.state, action_A)
+        after = carried(state, carry.success)
+        return after, seen(after, reward, done)
+
+    return LaneFunctions(begin, step)
+
 
 BLOCK = 16
 """Lanes that xla computes together."""
@@ -60,15 +124,15 @@ class Blocks:
             self.close()
             raise
 
-    def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> Seen:
+    def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> LaneResults:
         """Reset some lanes; returns what is seen in these."""
         return self.resets(lane_M, keys_M)[1]
 
-    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
+    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], LaneResults]:
         """Reset some lanes, in increasing order; returns the words of their carries, and what is seen in them."""
         return _joined(self._shared("resets", lane_M, keys_M))
 
-    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+    def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
         """Step all lanes."""
         places = zip(self._children, pairwise(self._bounds), strict=True)
         return _joined(self._answers([(child, ("step", action_N_A[slice(*place)])) for child, place in places]))
@@ -119,4 +183,4 @@ def _joined(answers: list[Any]) -> Any:
     if isinstance(answers[0], np.ndarray):
         return np.concatenate(answers)
     parts = [_joined(list(part)) for part in zip(*answers, strict=True)]
-    return Seen(*parts) if isinstance(answers[0], Seen) else tuple(parts)
+    return LaneResults(*parts) if isinstance(answers[0], LaneResults) else tuple(parts)

@@ -22,16 +22,15 @@ from es_service.protocol.child import require_same_process
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
 from workers.environments import TaskError, make_environment
-from workers.lanes.blocks import Blocks
-from workers.lanes.functions import Seen, lane_functions
+from workers.lanes.blocks import Blocks, LaneResults, lane_functions
+from workers.simd.backend.native import ALIGNMENT, Words, aligned, pack, unpack, words_of
 from workers.simd.backend.target import NoVectorsError
-from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, unpack, words_of
 from workers.simd.episodes.check import LANES, check_kernel, check_resets, reset_keys
 from workers.simd.episodes.kernel import Kernel, compile_kernel
 from workers.simd.graph.graph import Graph
 from workers.simd.graph.unsupported import UnsupportedError
 
-Resets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint32], Seen]]
+LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint32], LaneResults]]
 """Function of lanes and their reset keys [M, 4] -> (words of their carries [M, words], what is seen in them)."""
 
 
@@ -48,7 +47,7 @@ class Kernels(NamedTuple):
 class CompiledLanes:
     """Lanes that a kernel steps."""
 
-    def __init__(self, step: Kernel, resets: Resets, lanes: int, actions: int, threads: int) -> None:
+    def __init__(self, step: Kernel, resets: LaneResets, lanes: int, actions: int, threads: int) -> None:
         self.lanes, self._step, self._resets, self._width = lanes, step, resets, step.target.width
         self._carry_words = step.words_in - actions
         blocks = -(-lanes // self._width)
@@ -61,13 +60,13 @@ class CompiledLanes:
         self._maker = os.getpid()
         self._pool = ThreadPoolExecutor(len(self._shares)) if len(self._shares) > 1 else None
 
-    def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> Seen:
+    def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> LaneResults:
         """Reset some lanes; returns what is seen in these."""
         words_M, seen = self._resets(lane_M, keys_M)
         self.put(lane_M, words_M)
         return seen
 
-    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+    def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
         """Step all lanes."""
         self._words[:, self._carry_words :] = pack([action_N_A], self._width)
         if self._pool is None:
@@ -92,14 +91,14 @@ class CompiledLanes:
             self._pool.shutdown()
 
 
-def compiled_resets(begin: Kernel) -> Resets:
+def compiled_resets(begin: Kernel) -> LaneResets:
     """The resets of a kernel."""
 
-    def resets(lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
+    def resets(lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], LaneResults]:
         keys, width = pack([keys_M], begin.target.width), begin.target.width
         out = aligned((len(keys), begin.words_out, width))
         begin.run(keys, out)
-        carry_words = begin.words_out - sum(map(words_of, begin.out_avals[-len(Seen._fields) :]))
+        carry_words = begin.words_out - sum(map(words_of, begin.out_avals[-len(LaneResults._fields) :]))
         return _by_lane(out[:, :carry_words])[: len(lane_M)], _seen(begin, out, carry_words, len(lane_M))
 
     return resets
@@ -144,8 +143,8 @@ def kernels(name: str, options: tuple[tuple[str, OptionValue], ...], actions: in
     return Kernels(begun, stepped, lacks)
 
 
-def _seen(kernel: Kernel, out: Words, carry_words: int, lanes: int) -> Seen:
-    return Seen(*unpack(out[:, carry_words:], kernel.out_avals[-len(Seen._fields) :], lanes))
+def _seen(kernel: Kernel, out: Words, carry_words: int, lanes: int) -> LaneResults:
+    return LaneResults(*unpack(out[:, carry_words:], kernel.out_avals[-len(LaneResults._fields) :], lanes))
 
 
 def _by_lane(words: Words) -> NDArray[np.uint32]:

@@ -18,8 +18,7 @@ from es_service.protocol.child import answer_parent
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue
 from workers.environments import make_environment
-from workers.lanes.blocks import BLOCK
-from workers.lanes.functions import Seen, lane_functions
+from workers.lanes.blocks import BLOCK, LaneResults, lane_functions
 
 
 class BlockLanes:
@@ -31,11 +30,11 @@ class BlockLanes:
         key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
         tree = jax.tree.structure(jax.eval_shape(lambda key: begin(key)[0], key))
 
-        def begun(key: Any) -> tuple[list[Any], Seen]:
+        def begun(key: Any) -> tuple[list[Any], LaneResults]:
             carry, seen = begin(key)
             return jax.tree.leaves(carry), seen
 
-        def stepped(arrays: Sequence[Any], action_A: Any) -> tuple[list[Any], Seen]:
+        def stepped(arrays: Sequence[Any], action_A: Any) -> tuple[list[Any], LaneResults]:
             carry, seen = step(jax.tree.unflatten(tree, arrays), action_A)
             return jax.tree.leaves(carry), seen
 
@@ -46,7 +45,7 @@ class BlockLanes:
         self._arrays = [np.concatenate([array] * blocks) for array in map(np.asarray, padding)]
         """Arrays of the carries, [16 * blocks, ...]; those of no lane are some reset."""
 
-    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
+    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], LaneResults]:
         """See `Blocks.resets`."""
         place_M, seen_by_block = self._first + lane_M, []
         for block in np.unique(place_M // BLOCK):
@@ -58,9 +57,11 @@ class BlockLanes:
             for kept, array in zip(self._arrays, arrays, strict=True):
                 kept[place_M[is_here_M]] = np.asarray(array)[here]
             seen_by_block.append([np.asarray(array)[here] for array in seen])
-        return self._words_of(place_M), Seen(*(np.concatenate(arrays) for arrays in zip(*seen_by_block, strict=True)))
+        return self._words_of(place_M), LaneResults(
+            *(np.concatenate(arrays) for arrays in zip(*seen_by_block, strict=True))
+        )
 
-    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+    def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
         """See `Blocks.step`."""
         actions = np.zeros((len(self._arrays[0]), action_N_A.shape[1]), np.float32)
         actions[self._places] = action_N_A
@@ -71,7 +72,7 @@ class BlockLanes:
             for kept, array in zip(self._arrays, arrays, strict=True):
                 kept[of] = array
             seen_by_block.append(seen)
-        return Seen(*(np.concatenate(arrays)[self._places] for arrays in zip(*seen_by_block, strict=True)))
+        return LaneResults(*(np.concatenate(arrays)[self._places] for arrays in zip(*seen_by_block, strict=True)))
 
     def words(self) -> NDArray[np.uint32]:
         """See `Blocks.words`."""

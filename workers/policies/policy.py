@@ -2,18 +2,76 @@
 
 This module imports only NumPy, so that the driver can make the first centre and users can run a policy without JAX.
 Functions that also run inside compiled rollouts take the array namespace as `xp`.
+
+The memory is a gated recurrent cell (GRU). Actions are made of the outputs of the last layer by `policy.output`:
+
+tanh, linear: the outputs themselves; `tanh` has been applied by the network.
+argmax: the action with the greatest output is 1, the first of equal ones, and the others are 0.
+categorical: the same, drawn with probabilities that are the softmax of the outputs.
+gaussian: tanh of a normal variate, whose mean and log of the standard deviation are the two halves of the outputs.
+
+Only training episodes draw. In evaluations `categorical` takes the most probable action, as `argmax` does, and
+`gaussian` the tanh of the mean.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from es_service.protocol.messages import FloatArray
-from es_service.protocol.noise import Domain, normals, stream_keys
-from es_service.protocol.policy_spec import Activation, PolicySpec
-from workers.policies.recurrent import Dense, dense, next_memory
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys, uniforms
+from es_service.protocol.policy_spec import Activation, Output, PolicySpec
+
+
+def dense(x: Any, weights: Any, biases: Any) -> Any:
+    """x @ weights, plus the biases unless they are None."""
+    return x @ weights if biases is None else x @ weights + biases
+
+
+def dense_of_each(x: Any, weights: Any, biases: Any) -> Any:
+    """`dense` in NumPy, as a product for each row of x [..., in].
+
+    The libraries that NumPy multiplies with have one kernel for a vector and another one for a matrix. On many
+    processors the two round differently, so a row of one large product would differ from the product of that row.
+    """
+    return dense(x[..., None, :], weights, biases)[..., 0, :]
+
+
+Dense = Callable[[Any, Any, Any], Any]
+"""Function (x, weights, biases or None) -> outputs of a layer before its activation."""
+
+
+def next_memory(
+    xp: Any, gates: tuple[Any, Any], candidate: tuple[Any, Any], memory_H: Any, x: Any, dense: Dense = dense
+) -> Any:
+    """Memory after a step, between the memory before it and a candidate, as far as the gates say.
+
+        reset, keep = sigmoid(gates [x, memory])
+        candidate   = tanh(candidate [x, reset * memory])
+        memory      = keep * memory + (1 - keep) * candidate
+
+    Args:
+        gates: (weights [in + H, 2 H], biases [2 H] or None), first of the reset gate, then of the keep gate.
+        candidate: (weights [in + H, H], biases [H] or None).
+        memory_H: [..., H].
+        x: input of the cell, [..., in].
+        dense: function of a layer before its activation.
+
+    Source: the gated recurrent unit of Cho et al. 2014 (arXiv:1406.1078), with the reset before the product.
+    """
+    size = memory_H.shape[-1]
+    gates_2H = np.float32(0.5) * (xp.tanh(np.float32(0.5) * dense(_joined(xp, x, memory_H), *gates)) + np.float32(1.0))
+    reset_H, keep_H = gates_2H[..., :size], gates_2H[..., size:]
+    candidate_H = xp.tanh(dense(_joined(xp, x, reset_H * memory_H), *candidate))
+    return keep_H * memory_H + (np.float32(1.0) - keep_H) * candidate_H
+
+
+def _joined(xp: Any, x: Any, memory_H: Any) -> Any:
+    return xp.concatenate([x, memory_H], axis=-1)
+
 
 INITIAL_COLUMN_NORMS = {"unit_columns": (1.0, 0.01), "small_columns": (0.01, 0.01)}
 """(column norm of hidden layers, column norm of the output layer) for each value of `policy.init`.
@@ -52,7 +110,7 @@ def act(
         dense: function of a layer before its activation.
 
     Returns:
-        (outputs of the last layer, of which `workers.policies.outputs` makes an action; the memory after the step)
+        (outputs of the last layer, of which `workers.policies.policy` makes an action; the memory after the step)
     """
     hidden = spec.layers[: len(spec.widths) - 2]
     x = observation_O
@@ -94,3 +152,42 @@ def initial_parameters(spec: PolicySpec, init: str, seed: int, centre: int = 0) 
         if biases is not None:
             biases[:] = 0.0
     return parameters_D
+
+
+LOG_STD = (-5.0, 2.0)
+"""Limits of the log of the standard deviation of `gaussian`. Source: usual in implementations of SAC."""
+LEAST_UNIFORM = np.float32(2.0**-25)
+"""Replacement of a uniform variate of 0: half of the distance between variates."""
+
+
+def action(xp: Any, output: Output, outputs: Any) -> Any:
+    """Action [..., A] of an evaluation, from the outputs of the last layer [..., A], or [..., 2 A] of `gaussian`."""
+    if output in ("argmax", "categorical"):
+        return _chosen(xp, outputs)
+    if output == "gaussian":
+        return xp.tanh(outputs[..., : outputs.shape[-1] // 2])
+    return outputs
+
+
+def drawn_action(xp: Any, output: Output, outputs: Any, key: Any, coordinates_A: Any) -> Any:
+    """Action [A] of a step of training, before action noise; without draws it is that of an evaluation.
+
+    Args:
+        key: stream key of the episode's action noise.
+        coordinates_A: the step's coordinates in that stream, uint32.
+    """
+    if output == "categorical":
+        # The greatest of logits + Gumbel variates has the probabilities of the softmax.
+        uniform_A = xp.maximum(uniforms(key, coordinates_A), LEAST_UNIFORM)
+        return _chosen(xp, outputs - xp.log(-xp.log(uniform_A)))
+    if output == "gaussian":
+        half = outputs.shape[-1] // 2
+        std_A = xp.exp(xp.clip(outputs[..., half:], *map(np.float32, LOG_STD)))
+        normal_A = normal_integers(xp, key, coordinates_A).astype(np.float32) * np.float32(1.0 / NORMAL_STD)
+        return xp.tanh(outputs[..., :half] + std_A * normal_A)
+    return action(xp, output, outputs)
+
+
+def _chosen(xp: Any, outputs: Any) -> Any:
+    choice = xp.argmax(outputs, axis=-1)[..., None]
+    return (choice == np.arange(outputs.shape[-1])).astype(np.float32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from es_service.protocol.machine import platform_info, platform_text
+from es_service.protocol.process_environment import on_gpu
 from workers.rollouts.asked import Asked
 from workers.rollouts.backend import RolloutBackend
 from workers.rollouts.host import Host
@@ -11,3 +13,10 @@ from workers.rollouts.xla import Xla
 BACKENDS: dict[str, RolloutBackend] = {rollout.name: rollout for rollout in (Asked(), Host(), Xla(), Simd())}
 """Name, as in `compute.rollout` -> rollout, from the slowest to the fastest. `protocol.rollouts.choose` is what `auto`
 means."""
+
+
+def platform_of_gpu(rollout: str) -> str:
+    """`machine.platform_text` with the kind of GPU, if this process has been given one; else empty."""
+    if not on_gpu():
+        return ""
+    return platform_text(platform_info() | {"device": BACKENDS[rollout].device()})

@@ -17,9 +17,9 @@ from workers import progress
 from workers.compilable import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
 from workers.host.caller import Caller
-from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes
+from workers.host.episodes import EnvironmentPool, Watched, known_from_the_start, run_episodes
 from workers.host.functions import run_calls
-from workers.host.noise import gradient_summer, members
+from workers.host.policies import gradient_summer, members
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
@@ -79,7 +79,7 @@ class Host(RolloutBackend):
     ) -> Callable[[int], int]:
         """Steps of each environment of the batch in turn; one that ends is reset."""
         made = make_host_task(task.name, options)
-        lanes = [environment for _, environment in Lanes(made).of(range(batch))]
+        lanes = [environment for _, environment in EnvironmentPool(made).of(range(batch))]
         coordinates_A = np.arange(task.action_size, dtype=np.uint32)
         reset_keys_L_4 = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
         for lane in range(batch):
@@ -110,7 +110,7 @@ def make_runner(spec: WorkerSpec) -> tuple[Callable[..., Episodes], Callable[[It
         return partial(run_calls, function, caller, spec), lambda lanes: caller.start()
     described = spec.environment, spec.environment_options, spec.choices, spec.descriptor_size
     (task,) = [make_host_task(*described) for _ in progress.counted("making", described[:1])]
-    lanes = Lanes(task)
+    lanes = EnvironmentPool(task)
     return partial(run_episodes, lanes, spec), lanes.of
 
 

@@ -54,7 +54,7 @@ class Simd(RolloutBackend):
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.simd.episodes.rollout`."""
         from workers.rollouts.jax_tasks import judged
-        from workers.simd.episodes import low_rank_gradient, rollout
+        from workers.simd.episodes import low_rank, rollout
 
         gpu = on_gpu()
         if gpu:
@@ -72,7 +72,7 @@ class Simd(RolloutBackend):
             rollout.make_training_rollout(environment, spec, elsewhere),
             rollout.make_evaluation_rollout(environment, spec),
             rollout.make_policy_rollout(environment, spec),
-            low_rank_gradient.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
+            low_rank.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
             if spec.noise_rank
             else rollout.make_gradient_sum(spec.policy.parameters),
         )

@@ -1,4 +1,5 @@
-"""Search algorithms by name. Each method is a file of its own: its settings, its state and its functions.
+"""Search algorithms by name. A method, or a family that differs in a constant, is a file of its own: its settings, its
+state and its functions.
 
 An algorithm is a few pure functions of a `SearchState`; it does not run episodes itself. In each generation the driver
 asks it which centres restart from elites (`start_cells`), which elites it needs (`parents`) and which centres to
@@ -13,16 +14,15 @@ import pkgutil
 from collections.abc import Iterator, Mapping
 
 from es_service.config.search import PopulationConfig
-from es_service.search.algorithms.method import Method
-from es_service.search.algorithms.user_method import user_method
+from es_service.search.algorithms.method import Method, user_method
 
 
 def _shipped() -> Iterator[Method]:
-    """The method of each file of this folder that has one, under the name of the file."""
+    """The methods that files of this folder have under their own names."""
     for file in pkgutil.iter_modules(__path__):
-        method = getattr(importlib.import_module(f"{__name__}.{file.name}"), file.name, None)
-        if isinstance(method, Method):
-            yield method
+        for name, value in vars(importlib.import_module(f"{__name__}.{file.name}")).items():
+            if isinstance(value, Method) and value.name == name:
+                yield value
 
 
 def _by_simplicity(method: Method) -> tuple[int, str]:

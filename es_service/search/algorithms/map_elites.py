@@ -44,7 +44,7 @@ from es_service.search.algorithms.measured import (
 )
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import ELITES, settings_of
-from es_service.search.maps.batches import insert_each
+from es_service.search.maps.behaviour_map import insert_each
 from es_service.search.maps.kept import KeptPolicies
 
 PARENT_CHOICE = 3

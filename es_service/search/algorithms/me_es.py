@@ -11,7 +11,7 @@ a single one, so that with `alternation: round_robin` half of the emitters explo
 With `objectives`, the blocks of an emitter take these in turn instead; a block whose objective is not novelty counts as
 exploiting where an elite is drawn.
 
-The sources differ in how the elite is drawn (`cell_sampling`; its other values are those of `starts.py`):
+The sources differ in how the elite is drawn (`cell_sampling`; its other values are those of `common.start_shares`):
 
 * `top`, as in QDax, whose authors say they follow the paper. Exploring: one of the 5 most novel elites. Exploiting:
   with probability 1/2 one of the 2 fittest elites, else one of the 2 fittest of the 5 elites that entered last.
@@ -41,18 +41,19 @@ from es_service.config.parts import Count, FitnessObjective, NoveltyObjective, O
 from es_service.config.search import PresetRow
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
-from es_service.search.algorithms.common import novelty_search, population
-from es_service.search.algorithms.measured import measuring, offering
-from es_service.search.algorithms.method import method
-from es_service.search.algorithms.settings import EmittersSettings, settings_of
-from es_service.search.algorithms.starts import (
+from es_service.search.algorithms.common import (
     TRIED,
     counted_starts,
     counting,
     drawn_cell,
     elite_novelty,
+    novelty_search,
+    population,
     start_shares,
 )
+from es_service.search.algorithms.measured import measuring, offering
+from es_service.search.algorithms.method import method
+from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.objectives import weight_of_fitness
 

@@ -36,11 +36,19 @@ from es_service.search.algorithms.base import (
     from_elite,
     read_only,
 )
-from es_service.search.algorithms.common import novelty_search, population
+from es_service.search.algorithms.common import (
+    TRIED,
+    Starts,
+    counted_starts,
+    counting,
+    drawn_cell,
+    novelty_search,
+    population,
+    start_shares,
+)
 from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
-from es_service.search.algorithms.starts import TRIED, Starts, counted_starts, counting, drawn_cell, start_shares
 from es_service.search.maps.behaviour_map import Elite
 from es_service.search.objectives import weight_of_fitness
 

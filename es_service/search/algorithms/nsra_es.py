@@ -1,6 +1,7 @@
-"""NSRA-ES: novelty and fitness, with a weight that adapts to progress. Conti et al. 2018 (arXiv:1712.06560).
+"""The family of Conti et al. 2018 (arXiv:1712.06560): several centres (a meta-population) climb novelty and fitness.
 
-w is the weight of fitness. If an evaluated centre beats the record, w rises by `fitness_weight_step` (to at most 1).
+NS-ES climbs novelty alone, NSR-ES both in equal parts, and NSRA-ES both with a weight that adapts to progress: w is the
+weight of fitness. If an evaluated centre beats the record, w rises by `fitness_weight_step` (to at most 1).
 After `fitness_weight_patience` consecutive generations without such a centre, w falls by one step (to at least 0), and
 the count starts again. All centres share one record and one count. Initial centres set no record, so the first valid
 centre after them always does, as in the released code.
@@ -22,6 +23,18 @@ from es_service.search.algorithms.base import Algorithm, CentreEvaluation, Fitne
 from es_service.search.algorithms.common import novelty_search
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import CentresSettings, settings_of
+
+
+@method(CentresSettings)
+def ns_es(config: RunConfig) -> Algorithm:
+    """Novelty search: utilities are ranks of novelty; fitness has no influence."""
+    return novelty_search(config, fitness_weight=0.0)
+
+
+@method(CentresSettings)
+def nsr_es(config: RunConfig) -> Algorithm:
+    """Novelty search with reward: utilities are the mean of the ranks of novelty and of fitness."""
+    return novelty_search(config, fitness_weight=0.5)
 
 
 class NsraSettings(CentresSettings):

@@ -39,15 +39,15 @@ from tests.benchmarks.gpu.kernels import (
 from workers.environments import make_environment
 from workers.episode import episode_steps
 from workers.policies.policy import initial_parameters
+from workers.simd.backend.native import pack
 from workers.simd.backend.ptx import ptx
 from workers.simd.backend.target import target_of
-from workers.simd.backend.words import pack
-from workers.simd.episodes import reference
+from workers.simd.episodes import check
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.elementary import TANH
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 
 ARCHITECTURE = "sm_90a"
 LANES, STEPS = 256, 200
@@ -175,7 +175,7 @@ def rollout_files(folder: Path, task: str) -> None:
     constants = np.stack([mean_O[inputs_O], std_O[inputs_O]])
     lanes = np.broadcast_to(constants.reshape(-1, 1), (constants.size, 2 * PAIRS)).view(np.uint32)
     seen = np.stack(evaluate(graph, outputs, np.concatenate([kept[0], lanes])))
-    actions = reference.policy(spec.policy, inputs_O, seen, reference.perturbed(centre_D, unit, noise_keys))
+    actions = check.policy(spec.policy, inputs_O, seen, check.perturbed(centre_D, unit, noise_keys))
     noise = np.stack([normal_integers(np, key, layout.noise) for key in noise_keys[:2]])
     np.savez_compressed(
         folder / f"{task}_rollout.npz",

@@ -15,7 +15,7 @@ from es_service.protocol.policy_spec import PolicySpec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import episode_steps
 from workers.simd.backend.function_builder import FunctionBuilder
-from workers.simd.backend.ptx import Call, Pointer, lane_function
+from workers.simd.backend.ptx import Pointer, StepCall, lane_function
 from workers.simd.backend.target import Target
 from workers.simd.episodes.rollout import always_zero
 from workers.simd.gpu.program import KEY, function_of, step_functions, words_in
@@ -64,8 +64,8 @@ def physics_functions(physics: Physics, target: Target, *, quick: bool = False) 
     return [
         *begin,
         *step,
-        lane_function("begin", [Pointer("keys"), Pointer("states")], [Call(begin[-1], ("keys", "states"))], target),
-        lane_function("physics", [Pointer("states"), actions], [Call(step[-1], ("states", "actions"))], target),
+        lane_function("begin", [Pointer("keys"), Pointer("states")], [StepCall(begin[-1], ("keys", "states"))], target),
+        lane_function("physics", [Pointer("states"), actions], [StepCall(step[-1], ("states", "actions"))], target),
     ]
 
 
@@ -107,7 +107,7 @@ def episode_functions(task: str, target: Target, *, quick: bool = False) -> list
     environment, spec, inputs_O = make_environment(task, {}), worker_spec(task), inputs_of(task)
     steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
     reset = function_of("reset", steps.begin, [("keys", KEY)], "carries", target)
-    calls = [Call(reset[-1], ("keys", "carries"))]
+    calls = [StepCall(reset[-1], ("keys", "carries"))]
     return [
         *reset,
         lane_function("begin", [Pointer("keys"), Pointer("carries")], calls, target),
@@ -169,7 +169,7 @@ def operation_functions(target: Target, *, quick: bool = False) -> list[Function
         "compute", operations, [("given", argument) for argument in FIVE], "found", target, quick=quick
     )
     pointers = [Pointer("given"), Pointer("found")]
-    return [*functions, lane_function("operations", pointers, [Call(functions[-1], ("given", "found"))], target)]
+    return [*functions, lane_function("operations", pointers, [StepCall(functions[-1], ("given", "found"))], target)]
 
 
 def division_functions(target: Target) -> list[FunctionBuilder]:
@@ -183,7 +183,7 @@ def division_functions(target: Target) -> list[FunctionBuilder]:
         quick=True,
     )
     pointers = [Pointer("given"), Pointer("found")]
-    return [*functions, lane_function("division", pointers, [Call(functions[-1], ("given", "found"))], target)]
+    return [*functions, lane_function("division", pointers, [StepCall(functions[-1], ("given", "found"))], target)]
 
 
 def operation_arguments() -> np.ndarray:

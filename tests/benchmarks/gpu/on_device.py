@@ -40,7 +40,7 @@ VARIANTS = {
     "quick_128": (128, True),
     "quick_96": (96, True),
 }
-"""Code by name: (most registers of a thread, whether quotients are those of quick_division.py)."""
+"""Code by name: (most registers of a thread, whether quotients are those of `ptx.QuickWriter`)."""
 ROLLOUTS = ("ant_maze", "ant_trap")
 """Tasks whose training episodes are compared and timed."""
 POLICIES = {"policy_1_2": 4, "policy_1_4": 4, "policy_2_2": 8, "policy_2_3": 8, "policy_4_1": 16}

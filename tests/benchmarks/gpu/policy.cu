@@ -1,7 +1,7 @@
 // Perturbed policies on a GPU: INPUTS inputs, two hidden layers of 256 units and OUTPUTS outputs, tanh after each.
 //
 // The weights of the members of pair p are centre +- unit k_p, k = 2 j + 1, with the bits of
-// workers/simd/episodes/reference.py: every sum begins with the bias and adds its products in the order of the inputs,
+// workers/simd/episodes/check.py: every sum begins with the bias and adds its products in the order of the inputs,
 // each rounded once; the weights of + are (centre + unit) + 2 unit j, those of - in hidden layers 2 centre minus that
 // weight, and in the last layer (centre - unit) - 2 unit j. Compile with -ftz=true -fmad=false.
 //

@@ -25,13 +25,13 @@ from tests.workers.simd.emulated import arm_targets
 from tests.workers.simd.primitive_cases import CASES
 from tests.workers.simd.rollouts import arguments, every_target, targets, task_spec
 from workers.environments import make_environment
+from workers.simd.backend.native import require_same
 from workers.simd.backend.target import Target
 from workers.simd.episodes import compiled, kernel, rollout, variation
-from workers.simd.episodes.check import require_same
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 from workers.worker import make_worker
 
 GENTLE = settings(

@@ -18,8 +18,9 @@ from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.simd.rollouts import every_target, targets
 from workers.environments import make_environment
 from workers.simd.backend.function_builder import FunctionBuilder
+from workers.simd.backend.native import WrongCodeError, require_same
 from workers.simd.episodes import noise
-from workers.simd.episodes.check import WrongCodeError, check_episodes, check_resets, require_same
+from workers.simd.episodes.check import check_episodes, check_resets
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.rollout import make_gradient_sum

@@ -13,7 +13,7 @@ from jax import lax
 from tests.workers.simd.rollouts import every_target
 from workers.simd.backend.target import Target
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.graph import division
+from workers.simd.graph import elementary
 
 INF, NAN = math.inf, math.nan
 EDGES = np.array([0.0, -0.0, 1.0, -1.0, 2.5, -0.1, 5.0, 2.0**24, 2e-30, -2e-30, 1e14, 3e38, INF, -INF, NAN], np.float32)
@@ -53,7 +53,7 @@ def test_a_remainder_has_the_bits_of_xla_s_and_numpy_s(target: Target) -> None:
     edges = pairs(EDGES)
     with np.errstate(all="ignore"):
         size, step = np.abs(edges).astype(np.float64)
-        in_range = ~(size / step > division.QUOTIENT_LIMIT) | np.isinf(size) | (step == 0)
+        in_range = ~(size / step > elementary.QUOTIENT_LIMIT) | np.isinf(size) | (step == 0)
     for x, y in (quotients(), [side[in_range] for side in edges]):
         rest, modulo = kernel(x, y)
         for found, function in ((rest, lax.rem), (modulo, jnp.mod)):
@@ -67,7 +67,7 @@ def test_beyond_its_range_a_remainder_is_not_a_number() -> None:
     y = np.array([1.0, -0.1, 3e7, 9e-31, 1e-36], np.float32)
     x = np.array([3e14, -1e14, 1e22, 1.0, 1e-35], np.float32)
     assert np.isnan(kernel(x, y)).all()
-    last = np.float32(division.QUOTIENT_LIMIT)
+    last = np.float32(elementary.QUOTIENT_LIMIT)
     assert kernel(np.array([last, np.nextafter(last, np.float32(INF))]), np.ones(2, np.float32))[0] == 0.0
     small = np.array([1e-31, -1e-31], np.float32)
     np.testing.assert_array_equal(kernel(small, np.full(2, 5e-31, np.float32)), small)

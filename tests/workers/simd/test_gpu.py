@@ -14,7 +14,7 @@ from tests import helpers
 from tests.workers.simd.host_gpu import HostGpu, single_lanes
 from workers.environments import make_environment
 from workers.policies.policy import initial_parameters
-from workers.simd.episodes.check import WrongCodeError
+from workers.simd.backend.native import WrongCodeError
 from workers.simd.episodes.rollout import make_training_rollout
 from workers.simd.gpu.rollout import episodes_on_gpu
 from workers.worker import episode_keys

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.operations import OPERATIONS, compute
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 2.5, -3.5, math.inf, -math.inf, math.nan, 1e-38, 3e38], np.float32)
 

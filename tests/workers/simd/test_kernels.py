@@ -16,15 +16,14 @@ from jax import lax
 
 from tests.workers.simd.rollouts import every_target
 from workers.environments import make_environment
-from workers.simd.backend import emit, machine_code, target
+from workers.simd.backend import emit, native, target
+from workers.simd.backend.native import aligned, pack
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import aligned, pack
 from workers.simd.episodes.kernel import Kernel, compile_kernel
 from workers.simd.episodes.noise import gradient_module
-from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
 from workers.simd.graph.operations import OPERATIONS
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 
 LANES = 100
 
@@ -173,7 +172,7 @@ def control_word() -> int:
       ret i32 %value
     }
     declare void @llvm.x86.sse.stmxcsr(ptr)"""
-    address, alive = machine_code.load_object(machine_code.compile_object(text, host_target()), host_target())
+    address, alive = native.load_object(native.compile_object(text, host_target()), host_target())
     found = ctypes.CFUNCTYPE(ctypes.c_uint32)(address)()
     del alive
     return found
@@ -227,7 +226,7 @@ def test_the_host_may_be_a_mac_or_something_unknown(monkeypatch: pytest.MonkeyPa
     mac = host_target()
     assert (mac.isa, mac.width, mac.features) == ("neon", 4, "")
     assert mac.describe() == "apple-m1, NEON, 4 lanes"
-    code = machine_code.compile_object(gradient_module(mac), mac)
+    code = native.compile_object(gradient_module(mac), mac)
     assert code.startswith(b"\xcf\xfa\xed\xfe"), "an object file of macOS"
     with pytest.raises(target.NoVectorsError, match="AVX2 was requested, which arm64 does not have"):
         host_target("avx2")

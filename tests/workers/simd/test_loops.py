@@ -19,8 +19,7 @@ from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph import loops
 from workers.simd.graph.graph import Graph, depending, live
 from workers.simd.graph.operations import compute
-from workers.simd.graph.reference import evaluate
-from workers.simd.graph.schedule import Region, schedule
+from workers.simd.graph.schedule import Region, evaluate, schedule
 
 X = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
 

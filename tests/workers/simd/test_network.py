@@ -14,9 +14,8 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import every_target
 from workers.simd.backend.function_builder import FunctionBuilder, module
-from workers.simd.backend.native import load_compiled
+from workers.simd.backend.native import aligned, load_compiled
 from workers.simd.backend.target import Target
-from workers.simd.backend.words import aligned
 from workers.simd.episodes import layout
 from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan

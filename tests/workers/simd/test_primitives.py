@@ -15,7 +15,7 @@ from jax import lax
 
 from tests.workers.simd.primitive_cases import CASES
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.frontend.tracer import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
 

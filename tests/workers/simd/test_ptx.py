@@ -24,13 +24,13 @@ from tests.benchmarks.gpu.kernels import (
     physics_of,
 )
 from tests.workers.simd.host_gpu import on_host, single_lanes
-from workers.simd.backend.ptx import Call, Pointer, lane_function, ptx
+from workers.simd.backend.native import pack
+from workers.simd.backend.ptx import Pointer, StepCall, lane_function, ptx
 from workers.simd.backend.target import Target, target_of
-from workers.simd.backend.words import pack
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.operations import compute
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 
 LANES = 21
 NAN = np.uint32(0x7FC00000)
@@ -92,12 +92,12 @@ def test_loops_that_data_ends_have_the_bits_of_kernels_for_single_lanes(quick: b
     made = function_of("f", function, [("x", of)], "found", one, quick=quick)
     pointers = [Pointer("x"), Pointer("found")]
     found = np.zeros((2, LANES), np.uint32)
-    on_host([*made, lane_function("k", pointers, [Call(made[-1], ("x", "found"))], one)], "k")(
+    on_host([*made, lane_function("k", pointers, [StepCall(made[-1], ("x", "found"))], one)], "k")(
         np.ascontiguousarray(x.T), found, LANES, 1
     )
     np.testing.assert_array_equal(found, words_of(compile_kernel(function, of)(x)))
     made = function_of("f", function, [("x", of)], "found", target_of("ptx"), quick=quick)
-    assert ptx([*made, lane_function("k", pointers, [Call(made[-1], ("x", "found"))], target_of("ptx"))])
+    assert ptx([*made, lane_function("k", pointers, [StepCall(made[-1], ("x", "found"))], target_of("ptx"))])
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -150,7 +150,7 @@ def test_a_product_and_a_sum_are_fused_only_where_the_graph_says() -> None:
     def text(function) -> str:
         (made,) = function_of("f", function, arguments, "found", target_of("ptx"))
         pointers = [Pointer("given"), Pointer("found")]
-        return ptx([made, lane_function("k", pointers, [Call(made, ("given", "found"))], target_of("ptx"))])
+        return ptx([made, lane_function("k", pointers, [StepCall(made, ("given", "found"))], target_of("ptx"))])
 
     fused, apart = text(lambda a, b, c: a * b + c), text(lambda a, b, c: (a * b, a * b * c))
     assert fused.count("fma.rn.ftz.f32") == 1

@@ -19,7 +19,7 @@ from workers.simd.backend import emit
 from workers.simd.episodes import check, noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.indexing import MOST_CHOICES
-from workers.simd.frontend.primitives.registry import PRIMITIVES
+from workers.simd.frontend.tracer import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
 

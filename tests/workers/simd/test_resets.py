@@ -13,11 +13,11 @@ from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingCh
 from es_service.protocol.noise import Domain, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import describe_environment, make_environment
+from workers.simd.backend.native import unpack
 from workers.simd.backend.target import host_target
-from workers.simd.backend.words import unpack
 from workers.simd.episodes import rollout
 from workers.simd.episodes.kernel import compile_kernel, compile_resets
-from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.frontend.tracer import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
 

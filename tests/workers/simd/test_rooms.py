@@ -107,7 +107,7 @@ import numpy as np
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import host_target
-from workers.simd.backend.words import aligned
+from workers.simd.backend.native import aligned
 from workers.simd.graph.folding import FoldingGraph
 
 graph, target = FoldingGraph(), host_target()

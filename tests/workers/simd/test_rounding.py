@@ -23,9 +23,8 @@ from tests.helpers import spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.emit import emit
-from workers.simd.backend.native import load_compiled
+from workers.simd.backend.native import aligned, load_compiled, pack
 from workers.simd.backend.target import host_target
-from workers.simd.backend.words import aligned, pack
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.rollout import always_zero
@@ -34,8 +33,7 @@ from workers.simd.graph import loops
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
 from workers.simd.graph.operations import compute
-from workers.simd.graph.reference import evaluate
-from workers.simd.graph.schedule import Region, schedule
+from workers.simd.graph.schedule import Region, evaluate, schedule
 
 PAIRS, STEPS = 24, 25
 COMPARED = ("fitness", "returns", "descriptor", "steps", "goal_distance")

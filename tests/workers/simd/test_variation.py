@@ -11,9 +11,9 @@ from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
 from tests.workers.simd.rollouts import every_target
 from workers.rollouts import BACKENDS
+from workers.simd.backend.native import WrongCodeError
 from workers.simd.backend.target import Target
 from workers.simd.episodes import variation
-from workers.simd.episodes.check import WrongCodeError
 
 RULES = (IsoLine(0.005, 0.05), IsoLine(0.0, 0.0), IsoLine(0.3, 0.0), IsoLine(3.7, 11.3))
 

@@ -20,12 +20,22 @@ from workers.compilable import Compilable
 from workers.environments import Environment
 from workers.episode import Carry
 from workers.rollouts.backend import Episodes, no_faults
-from workers.simd.backend.native import Native, load_compiled
+from workers.simd.backend.native import (
+    ALIGNMENT,
+    Native,
+    Words,
+    aligned,
+    filled,
+    load_compiled,
+    pack,
+    require,
+    unpack,
+    words_of,
+)
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import ALIGNMENT, Words, aligned, filled, pack, require, unpack, words_of
 from workers.simd.episodes.kernel import Check, compile_resets, no_check
 from workers.simd.episodes.layout import Network
-from workers.simd.episodes.low_rank import LowRankNoise
+from workers.simd.episodes.low_rank import BlockNoise
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
 
 
@@ -40,7 +50,7 @@ class EpisodeKernel:
     inputs_O: np.ndarray
     """Indices of the observations that are computed, as inputs of the policy."""
     network: Network
-    low_rank: LowRankNoise | None
+    low_rank: BlockNoise | None
     """Layout of the noise of training episodes, if it has low rank."""
     begin: Compilable
     """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""

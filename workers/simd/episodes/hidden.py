@@ -20,7 +20,7 @@ from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.layout import Layer, Network
 from workers.simd.episodes.noise import noise_of_weights
-from workers.simd.frontend.primitives.choices import extreme_of
+from workers.simd.frontend.primitives.elementwise import extreme_of
 from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph
 

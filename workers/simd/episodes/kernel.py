@@ -16,11 +16,19 @@ import numpy as np
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable, jitted
 from workers.simd.backend.emit import emit
-from workers.simd.backend.native import Native, load_compiled
+from workers.simd.backend.native import (
+    ALIGNMENT,
+    Native,
+    Words,
+    aligned,
+    load_compiled,
+    pack,
+    require,
+    unpack,
+    words_of,
+)
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, require, unpack, words_of
-from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import draws, trace_jaxpr
+from workers.simd.frontend.trace import draws, jaxpr_digest, trace_jaxpr
 from workers.simd.graph.graph import Graph, live
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.unsupported import UnsupportedError

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.policy_spec import Activation, Output, PolicySpec
+from workers.simd.backend.native import ALIGNMENT, aligned
 from workers.simd.backend.target import Target
-from workers.simd.backend.words import ALIGNMENT, aligned
 
 KEPT_BYTES = 1 << 18
 """Most bytes of the weights that are kept for a block of members; they are read in each step and must stay in L2."""

@@ -6,24 +6,47 @@ All members share the weights of the centre. What a member has of its own is in 
 
 in the order of the ranks, with fused products. The sums of x A are in the order of the inputs, a member in each lane;
 so the outputs of a hidden layer are exchanged to [input, lane] for the next one.
+
+A gradient is the sum of weighted noise over a block of pairs:
+
+    weight (i, j)   scale * sum over pairs and ranks of (w A[r, i]) B[r, j]
+    bias (j)        scale * sum over pairs of w k[j]
+
+with fused products, pairs and ranks in their order, and w A rounded. The scale makes noise integers standard normal.
 """
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.low_rank import layers_of_noise, product_unit
+from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
+from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.policy_spec import PolicySpec
-from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.compilable import Compilable
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same
+from workers.simd.backend.target import Target, host_target
 from workers.simd.episodes.layout import Layer
-from workers.simd.episodes.noise import by_sign, float_constant, noise_of_weights
+from workers.simd.episodes.noise import (
+    UNROLLED,
+    by_sign,
+    definition,
+    float_constant,
+    lanes,
+    load_key,
+    noise_of,
+    noise_of_weights,
+)
+from workers.simd.graph.operations import compute
 
 
-class LowRankNoise(NamedTuple):
+class BlockNoise(NamedTuple):
     """The noise of a block of members in memory: an array of `noise.fill_function`.
 
     Its vectors are those of hidden layers: for each tile of outputs the rows of B and then the biases. Its single
@@ -54,7 +77,7 @@ class LowRankNoise(NamedTuple):
 
 def plan_noise(
     spec: PolicySpec, rank: int, inputs_O: NDArray[np.intp], hidden: Sequence[Layer], width: int
-) -> LowRankNoise:
+) -> BlockNoise:
     """Lay out the noise of a policy whose hidden layers have this layout, in vectors of `width` lanes.
 
     Args:
@@ -76,10 +99,10 @@ def plan_noise(
     right = sum(map(len, singles))
     singles += [last.right.reshape(-1), *([] if last.bias is None else [last.bias])]
     places = np.concatenate([np.array(vectors, np.uint32), *singles])
-    return LowRankNoise(rank, spec.bias, tuple(first), tuple(left), right, len(vectors), places)
+    return BlockNoise(rank, spec.bias, tuple(first), tuple(left), right, len(vectors), places)
 
 
-def thin_sums(builder: FunctionBuilder, noise: LowRankNoise, layer: int, inputs: int, x: str) -> Values:
+def thin_sums(builder: FunctionBuilder, noise: BlockNoise, layer: int, inputs: int, x: str) -> Values:
     """The vectors t of each rank, a member in each lane, of layer number `layer` with inputs x [input, lane]."""
     floats, rank, singles = builder.llvm_types["f"], noise.rank, noise.singles(builder)
     unit = builder.value(f"fmul float %unit, {float_constant(product_unit(rank))}")
@@ -98,7 +121,7 @@ def thin_sums(builder: FunctionBuilder, noise: LowRankNoise, layer: int, inputs:
 
 
 def begins_of_hidden(
-    builder: FunctionBuilder, noise: LowRankNoise, layer: Layer, number: int, thin: str
+    builder: FunctionBuilder, noise: BlockNoise, layer: Layer, number: int, thin: str
 ) -> Callable[[str, str, Values], Values]:
     """Function (first member, tile, the centre's biases of each member and vector of the tile) -> first values of the
     sums of these members, for hidden layer `number`.
@@ -134,7 +157,7 @@ def begins_of_hidden(
 
 
 def begins_of_last(
-    builder: FunctionBuilder, noise: LowRankNoise, outputs: range, count: int, biases: Values, thin: Values
+    builder: FunctionBuilder, noise: BlockNoise, outputs: range, count: int, biases: Values, thin: Values
 ) -> Values:
     """First values of the sums of some outputs of the last layer, a member in each lane.
 
@@ -151,7 +174,7 @@ def begins_of_last(
     return sums
 
 
-def _moved(builder: FunctionBuilder, noise: LowRankNoise, value: str, rows: Values, unit: str, factors: Values) -> str:
+def _moved(builder: FunctionBuilder, noise: BlockNoise, value: str, rows: Values, unit: str, factors: Values) -> str:
     """A sum before the inputs: the centre's bias, and what a member adds to it.
 
     Args:
@@ -168,3 +191,164 @@ def _integer(builder: FunctionBuilder, bytes_: str, vector: str | int) -> str:
     """Vector of noise integers k = 2 j + 1, as floats, of a vector of bytes j."""
     one, two = (builder.splat(float_constant(np.float32(value))) for value in (1.0, 2.0))
     return builder.fma(noise_of_weights(builder, bytes_, vector), two, one)
+
+
+TABLE = 6
+"""Numbers of a layer in the table of the kernel."""
+
+
+def make_low_rank_gradient_sum(policy: PolicySpec, rank: int, target: Target | None = None) -> Compilable:
+    """Sum of weighted noise, with the interface of `workers.rollout.make_low_rank_gradient_sum`; compiled here."""
+    target = target or host_target()
+    group = UNROLLED * target.width
+    drawn = -(-numbers(policy, rank) // target.width)
+    table, count = layer_table(policy, rank), policy.parameters
+    of_products = np.float32(product_unit(rank) / NORMAL_STD)
+    signature = [*[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 4, ctypes.c_float]
+
+    def function(native: Native):
+        call = native.function(*signature)
+
+        def gradient_sum(weights_P: NDArray[np.float32], noise_keys_P: NDArray[np.uint32]) -> NDArray[np.float32]:
+            weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
+            pairs = len(weights_P)
+            require(keys_P.dtype == np.uint32 and keys_P.shape == (pairs, KEY_WORDS), "a key for each weight")
+            # A group of vectors that begins at the last output of a row reads and writes what follows it.
+            rows = aligned((pairs * drawn * target.width + group,)).view(np.float32)
+            sums = aligned((count + group,)).view(np.float32)
+            call(weights_P, keys_P, rows, table, sums, pairs, drawn, rank, len(table), of_products)
+            return sums[:count]
+
+        return gradient_sum
+
+    name, text = f"gradient of low rank {definition()}", lambda: gradient_module(target)
+    checked = lambda native: check_low_rank_gradient(function(native), policy, rank)  # noqa: E731
+    gradient_sum = function(load_compiled(name, text, target, check=checked))
+    return Compilable(gradient_sum, lambda *_: None)
+
+
+def layer_table(policy: PolicySpec, rank: int) -> NDArray[np.int64]:
+    """Of each layer: first coordinates of A, of B and of the biases (-1 if there are none), the numbers of its inputs
+    and outputs, and the place of its first weight among the parameters."""
+    ends = accumulate((inputs + policy.bias) * outputs for inputs, outputs in policy.layers)
+    rows = [
+        (left[0, 0], right[0, 0], -1 if bias is None else bias[0], left.shape[1], right.shape[1], start)
+        for (left, right, bias), start in zip(layers_of_noise(policy, rank), [0, *ends], strict=False)
+    ]
+    return np.array(rows, np.int64)
+
+
+def gradient_module(target: Target) -> str:
+    """LLVM IR of `void kernel(ptr weights, ptr keys, ptr rows, ptr table, ptr sums, i64 pairs, i64 drawn, i64 rank,
+    i64 layers, float of_products)`.
+
+    rows has room for `drawn` vectors of noise of each pair and sums for the parameters, both for a group of vectors
+    more. The sums are written in their order: what a group writes beyond the end of its row is written again.
+    """
+    pointers = [f"ptr noalias %{name}" for name in ("weights", "keys", "rows", "table", "sums")]
+    integers = [f"i64 %{name}" for name in ("pairs", "drawn", "rank", "layers")]
+    builder = FunctionBuilder("inside", [*pointers, *integers, "float %of_products"], target)
+    width, floats, group = target.width, builder.llvm_types["f"], UNROLLED * target.width
+    of_products = builder.splat("%of_products")
+    of_numbers = builder.splat(float_constant(np.float32(1.0 / NORMAL_STD)))
+    stride = builder.index(("%drawn", width))
+
+    def draw(pair: str, _: Values) -> Values:
+        key, first = load_key(builder, "%keys", pair), builder.value(f"mul i64 {pair}, %drawn")
+
+        def vector(at: str, _: Values) -> Values:
+            start = builder.splat(builder.value(f"trunc i64 {builder.index((at, width))} to i32"), "i")
+            coordinate = builder.value(f"add {builder.llvm_types['i']} {start}, {lanes(builder)}")
+            k = noise_of(builder, key, coordinate, halved=False)
+            value = builder.value(f"sitofp {builder.llvm_types['i']} {k} to {floats}")
+            builder.store(floats, value, "%rows", builder.index((first, 1), (at, 1)))
+            return []
+
+        builder.loop("%drawn", vector)
+        return []
+
+    def group_at(pointer: str, place: str) -> list[str]:
+        """Addresses of the vectors of a group, whose first number is at a place."""
+        return [builder.at(pointer, builder.index((place, 1), (v * width, 1)), "float") for v in range(UNROLLED)]
+
+    def added(factor: str, place: str, sums: Values) -> Values:
+        vectors = [builder.value(f"load {floats}, ptr {at}, align 4") for at in group_at("%rows", place)]
+        return [builder.fma(builder.splat(factor), vector, total) for vector, total in zip(vectors, sums, strict=True)]
+
+    def write(scale: str, sums: Values, place: str) -> None:
+        for at, total in zip(group_at("%sums", place), sums, strict=True):
+            builder.do(f"store {floats} {builder.value(f'fmul {floats} {total}, {scale}')}, ptr {at}, align 4")
+
+    zeros = [(floats, "zeroinitializer")] * UNROLLED
+
+    def layer(number: str, _: Values) -> Values:
+        left, right, bias, inputs, outputs, start = (
+            builder.load("i64", "%table", builder.index((number, TABLE), (place, 1))) for place in range(TABLE)
+        )
+        groups = builder.value(f"udiv i64 {builder.index((outputs, 1), (group - 1, 1))}, {group}")
+
+        def row(i: str, _: Values) -> Values:
+            first = builder.index((start, 1), (builder.value(f"mul i64 {i}, {outputs}"), 1))
+
+            def block(j: str, _: Values) -> Values:
+                def add_pair(pair: str, sums: Values) -> Values:
+                    weight = builder.load("float", "%weights", pair)
+                    of_pair = builder.value(f"mul i64 {pair}, {stride}")
+
+                    def add_rank(r: str, sums: Values) -> Values:
+                        at_left, at_right = (builder.value(f"mul i64 {r}, {size}") for size in (inputs, outputs))
+                        a = builder.load("float", "%rows", builder.index((of_pair, 1), (left, 1), (at_left, 1), (i, 1)))
+                        place = builder.index((of_pair, 1), (right, 1), (at_right, 1), (j, group))
+                        return added(builder.value(f"fmul float {weight}, {a}"), place, sums)
+
+                    return builder.loop("%rank", add_rank, [(floats, total) for total in sums])
+
+                write(of_products, builder.loop("%pairs", add_pair, zeros), builder.index((first, 1), (j, group)))
+                return []
+
+            builder.loop(groups, block)
+            return []
+
+        def biases() -> None:
+            first = builder.index((start, 1), (builder.value(f"mul i64 {inputs}, {outputs}"), 1))
+
+            def block(j: str, _: Values) -> Values:
+                def add_pair(pair: str, sums: Values) -> Values:
+                    of_pair = builder.value(f"mul i64 {pair}, {stride}")
+                    place = builder.index((of_pair, 1), (bias, 1), (j, group))
+                    return added(builder.load("float", "%weights", pair), place, sums)
+
+                write(of_numbers, builder.loop("%pairs", add_pair, zeros), builder.index((first, 1), (j, group)))
+                return []
+
+            builder.loop(groups, block)
+
+        builder.loop(inputs, row)
+        builder.when(builder.value(f"icmp sge i64 {bias}, 0"), biases)
+        return []
+
+    builder.loop("%pairs", draw)
+    builder.loop("%layers", layer)
+    return module([builder])
+
+
+def check_low_rank_gradient(gradient_sum: Callable[..., np.ndarray], policy: PolicySpec, rank: int) -> None:
+    """Raise WrongCodeError unless a sum of noise of low rank over a few pairs has the bits of its definition."""
+    keys_P = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(3))
+    weights_P = np.random.default_rng(0).normal(size=3).astype(np.float32)
+    coordinates_N = np.arange(numbers(policy, rank), dtype=np.uint32)
+    k_P_N = np.stack([normal_integers(np, key, coordinates_N) for key in keys_P]).astype(np.float32)
+    wanted: list[np.ndarray] = []
+    for left_R_I, right_R_J, bias_J in layers_of_noise(policy, rank):
+        shape = left_R_I.shape[1], right_R_J.shape[1]
+        sums_I_J, sums_J = np.zeros(shape, np.float32), np.zeros(shape[1], np.float32)
+        for weight, k_N in zip(weights_P, k_P_N, strict=True):
+            for left_I, right_J in zip(left_R_I, right_R_J, strict=True):
+                weighted_I = compute("mul", [np.full_like(k_N[left_I], weight), k_N[left_I]])
+                sums_I_J = compute("fma", [*np.broadcast_arrays(weighted_I[:, None], k_N[right_J]), sums_I_J])
+            if bias_J is not None:
+                sums_J = compute("fma", [np.full(shape[1], weight), k_N[bias_J], sums_J])
+        of_products = np.float32(product_unit(rank) / NORMAL_STD)
+        wanted.append(compute("mul", [sums_I_J, np.full_like(sums_I_J, of_products)]).reshape(-1))
+        wanted += [] if bias_J is None else [compute("mul", [sums_J, np.full_like(sums_J, 1.0 / NORMAL_STD)])]
+    require_same(gradient_sum(weights_P, keys_P), np.concatenate(wanted), "a gradient of low rank")

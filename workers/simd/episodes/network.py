@@ -18,7 +18,7 @@ from typing import Literal
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.hidden import View, activated, first_sums, per_lane, perturbed, shared, units
 from workers.simd.episodes.layout import Network
-from workers.simd.episodes.low_rank import LowRankNoise, begins_of_hidden, begins_of_last, thin_sums
+from workers.simd.episodes.low_rank import BlockNoise, begins_of_hidden, begins_of_last, thin_sums
 from workers.simd.episodes.noise import by_sign, noise_of_weights
 
 Weights = Literal["shared", "perturbed", "per_lane"]
@@ -27,7 +27,7 @@ OUTPUTS_AT_ONCE = 4
 """Most outputs of the last layer that are computed in one loop over its inputs."""
 
 
-def policy_function(network: Network, weights: Weights, low_rank: LowRankNoise | None = None) -> FunctionBuilder:
+def policy_function(network: Network, weights: Weights, low_rank: BlockNoise | None = None) -> FunctionBuilder:
     """Function `void policy(ptr x, ptr alive, ..., ptr hidden, ptr action)`, with between them
 
         shared                          ptr centre

@@ -11,8 +11,7 @@ from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.target import Target
-from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
 
 UNROLLED = 4
 """Number of vectors of noise that are made in one trip of the gradient's loop."""

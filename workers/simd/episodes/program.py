@@ -23,15 +23,14 @@ from workers.environments import Environment
 from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.native import words_of
 from workers.simd.backend.target import Target
-from workers.simd.backend.words import words_of
 from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan
-from workers.simd.episodes.low_rank import LowRankNoise, plan_noise
+from workers.simd.episodes.low_rank import BlockNoise, plan_noise
 from workers.simd.episodes.network import Weights, policy_function, singles_function
 from workers.simd.episodes.noise import definition, fill_function
-from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
 from workers.simd.graph.graph import Graph
 
 Traced = tuple[Graph, int, list[int]]
@@ -47,7 +46,7 @@ class EpisodeProgram(NamedTuple):
     alive_word: int
     """Index of the word of a carry that says whether the episode is alive."""
     network: Network
-    low_rank: LowRankNoise | None
+    low_rank: BlockNoise | None
     """Layout of the noise of training episodes, if it has low rank."""
     of_steps: dict[str, range]
     """Words of a carry that have an output of each step, by its name."""
@@ -121,7 +120,7 @@ def _module(
     normalised_observation: Traced,
     advance: Traced,
     network: Network,
-    low_rank: LowRankNoise | None,
+    low_rank: BlockNoise | None,
     inputs: int,
     words: int,
     alive_word: int,

@@ -22,9 +22,8 @@ from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
 from workers.rollouts.backend import Episodes, no_faults
-from workers.simd.backend.native import Native, load_compiled
+from workers.simd.backend.native import Native, aligned, load_compiled, require
 from workers.simd.backend.target import Target, host_target, target_of
-from workers.simd.backend.words import aligned, require
 from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module

@@ -25,17 +25,15 @@ from es_service.protocol.sources import user_path
 from workers.environments import Environment, make_environment
 from workers.rollouts.backend import Examination
 from workers.simd.backend import cache
-from workers.simd.backend.native import OWN_VERSION
-from workers.simd.backend.words import pack, words_of
+from workers.simd.backend.native import OWN_VERSION, pack, words_of
 from workers.simd.episodes.check import as_words
 from workers.simd.episodes.kernel import DRAWN
 from workers.simd.episodes.rollout import training_program, why_not
-from workers.simd.frontend.digest import jaxpr_digest
-from workers.simd.frontend.trace import draws, trace_jaxpr
+from workers.simd.frontend.trace import draws, jaxpr_digest, trace_jaxpr
 from workers.simd.frontend.tracer import line_of
 from workers.simd.graph.graph import Graph, reached
 from workers.simd.graph.operations import OPERATIONS
-from workers.simd.graph.reference import evaluate
+from workers.simd.graph.schedule import evaluate
 from workers.simd.graph.unsupported import UnsupportedError, fault
 
 ACTIONS: dict[str, Callable[[int, int], Any]] = {
@@ -84,7 +82,7 @@ class _Traced(NamedTuple):
         return [place for place, name in enumerate(self.names) if name.partition("[")[0].partition(".")[0] == field]
 
 
-Found = tuple[int, int]
+FaultPlace = tuple[int, int]
 """(place of an output, lane) where something was found."""
 Record = Callable[[int, Sequence[Any], Any], object]
 """Told of an operation by its node, its arguments and its result."""
@@ -228,7 +226,7 @@ def _computed(traced: _Traced, words: np.ndarray, record: Record = lambda *_: No
         return as_words(evaluate(traced.graph, traced.outputs, words, operation, fuse=False))
 
 
-def _hidden(values: np.ndarray, alive_L: np.ndarray) -> Found | None:
+def _hidden(values: np.ndarray, alive_L: np.ndarray) -> FaultPlace | None:
     """The first output that JAX and simd have differently."""
     return _first(_differ(values[:, :LANES], values[:, LANES:]) & alive_L)
 
@@ -238,7 +236,7 @@ def _differ(words: np.ndarray, others: np.ndarray) -> np.ndarray:
     return (words != others) & ~(np.isnan(words.view(np.float32)) & np.isnan(others.view(np.float32)))
 
 
-def _not_finite(traced: _Traced, values: np.ndarray, alive_L: np.ndarray) -> Found | None:
+def _not_finite(traced: _Traced, values: np.ndarray, alive_L: np.ndarray) -> FaultPlace | None:
     """The first output of which an episode is invalid."""
     floats = np.array([traced.graph.dtypes[node] == "f" for node in traced.outputs])
     of_policy = np.isin(np.arange(len(floats)), traced.places("observation"))
@@ -248,12 +246,12 @@ def _not_finite(traced: _Traced, values: np.ndarray, alive_L: np.ndarray) -> Fou
     return _first(is_bad & alive_L)
 
 
-def _first(is_found: np.ndarray) -> Found | None:
+def _first(is_found: np.ndarray) -> FaultPlace | None:
     places, lanes = np.nonzero(is_found)
     return (int(places[0]), int(lanes[0])) if places.size else None
 
 
-def _explained(traced: _Traced, words: np.ndarray, found: Found, step: int, *, is_hidden: bool) -> str:
+def _explained(traced: _Traced, words: np.ndarray, found: FaultPlace, step: int, *, is_hidden: bool) -> str:
     """What was found, in words, with the lines of the task from which it comes."""
     graph, (output, lane) = traced.graph, found
     differing: set[int] = set()

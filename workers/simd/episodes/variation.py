@@ -15,10 +15,8 @@ import numpy as np
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from es_service.protocol.recipes import FloatArray, IsoLine, Recipes, recipes_of
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
-from workers.simd.backend.native import Native, load_compiled
+from workers.simd.backend.native import Native, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import require
-from workers.simd.episodes.check import require_same
 from workers.simd.episodes.noise import definition, float_constant, lanes, load_key, noise_of
 
 

@@ -2,13 +2,17 @@
 
 Operations that only move values (slices, gathers, transposes) are done while tracing, on the node numbers, and cost the
 kernel nothing. Arithmetic adds nodes.
+
+The modules of `primitives/` register their rules here, by the names of primitives. `graph_dtype` says which dtypes of
+JAX are supported.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,17 +22,83 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
 from es_service.protocol.raised import is_users_file
-from workers.simd.frontend.dtypes import bits_of, graph_dtype, is_signed, overflows
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop, build_while
 from workers.simd.graph.unsupported import UnsupportedError, refusing, way_round
 
+
+@functools.cache
+def graph_dtype(dtype: Any) -> str:
+    """Dtype of the graph nodes that represent values of a JAX dtype: "f", "i", "b" or, of JAX's threefry keys, "k".
+
+    Integers of 8 and 16 bits are 32-bit integers of the same value; see `overflows`.
+
+    Raises:
+        UnsupportedError: the dtype is any other.
+    """
+    match str(dtype):
+        case "float32":
+            return "f"
+        case "int32" | "uint32" | "int16" | "uint16" | "int8" | "uint8":
+            return "i"
+        case "bool":
+            return "b"
+        case "key<fry>":
+            return "k"
+    advice = way_round("random_bits") if str(dtype).startswith("key<") else ""
+    raise UnsupportedError(
+        f"values of type {dtype}: simd supports float32, integers of 8, 16 and 32 bits, bool and threefry keys",
+        advice=advice,
+    )
+
+
+def is_signed(dtype: str) -> bool:
+    """Whether integers of a JAX dtype may be negative."""
+    return dtype.startswith("int")
+
+
+def bits_of(dtype: str) -> int:
+    """Number of bits of an integer dtype."""
+    return 8 * np.dtype(dtype).itemsize
+
+
+NARROW = {"int8", "int16", "uint8", "uint16"}
+MOVES = {"broadcast_in_dim", "reshape", "squeeze", "slice", "transpose", "concatenate", "stack", "unstack", "copy",
+         "select_n", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "jit", "while", "scan", "cond",
+         "random_bits"}  # fmt: skip
+"""Primitives that only move or choose integers, or whose parts reduce them."""
+
+
+def overflows(equation: Any) -> list[str]:
+    """For each output of an equation, the dtype of 8 or 16 bits to whose range it must be reduced, or ""."""
+    moves = equation.primitive.name in MOVES
+    dtypes = [str(variable.aval.dtype) for variable in equation.outvars]
+    return ["" if moves or dtype not in NARROW else dtype for dtype in dtypes]
+
+
+def dtype_in(equation: Any, position: int = 0) -> str:
+    """Name of the JAX dtype of one input of an equation."""
+    return str(equation.invars[position].aval.dtype)
+
+
 Nodes = NDArray[np.int64]
 """Node numbers, in the shape of the array that they represent."""
-Rule = Callable[..., Any]
+PrimitiveRule = Callable[..., Any]
 """Rule of a primitive for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of arrays."""
 GRAPH_LIMIT = 2_000_000
 """Most nodes of a graph; a greater one would take too long to compile."""
+PRIMITIVES: dict[str, PrimitiveRule] = {}
+"""Rules by the name of JAX's primitive."""
+
+
+def primitive(*names: str) -> Callable[[PrimitiveRule], PrimitiveRule]:
+    """Decorator that registers a rule under the names of primitives."""
+
+    def enter(rule: PrimitiveRule) -> PrimitiveRule:
+        PRIMITIVES.update(dict.fromkeys(names, rule))
+        return rule
+
+    return enter
 
 
 class Place(NamedTuple):
@@ -55,8 +125,8 @@ def line_of(place: Place | None) -> str:
 class Tracer:
     """Evaluator of jaxprs by the rules of their primitives; its methods make the nodes for these rules."""
 
-    def __init__(self, graph: FoldingGraph, rules: Mapping[str, Rule]) -> None:
-        self.graph, self.rules = graph, rules
+    def __init__(self, graph: FoldingGraph) -> None:
+        self.graph = graph
         self.remembered: dict[Any, Any] = {}
         """What one rule notes of nodes for another."""
         self.lanes: int | None = None
@@ -79,7 +149,7 @@ class Tracer:
         outer = self.graph.place
         for equation in jaxpr.eqns:
             self.graph.place = Place(equation.source_info, outer)
-            rule = self.rules.get(equation.primitive.name)
+            rule = PRIMITIVES.get(equation.primitive.name)
             try:
                 if rule is None:
                     name = equation.primitive.name

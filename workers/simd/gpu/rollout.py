@@ -15,11 +15,10 @@ from es_service.protocol.noise import Keys
 from workers.compilable import Compilable
 from workers.environments import Environment
 from workers.rollouts.backend import Episodes
-from workers.simd.episodes.check import require_same
+from workers.simd.backend.native import require_same
 from workers.simd.episodes.compiled import EpisodeKernel
 from workers.simd.gpu.driver import Gpu, GpuArray, Module, the_gpu
-from workers.simd.gpu.network import TILE, GpuLayer, layers_of
-from workers.simd.gpu.program import episode_functions
+from workers.simd.gpu.program import TILE, GpuLayer, episode_functions, layers_of
 
 STEPS_BETWEEN_LOOKS = 25
 """Control steps after which the processor looks whether any episode goes on; it costs some tens of microseconds."""
@@ -27,7 +26,7 @@ CHECKED = 8
 """Pairs whose episodes are compared with those of the processor, when code is new to this process."""
 
 
-class _Room(NamedTuple):
+class _GpuMemory(NamedTuple):
     """Memory of the GPU for a number of pairs."""
 
     noises: GpuArray
@@ -65,7 +64,7 @@ class GpuEpisodes:
         """Prepare them; kernels are compiled when they are needed."""
         self._environment, self._spec, self._gpu = environment, spec, gpu
         self._programs: dict[bytes, _Program] = {}
-        self._rooms: dict[tuple[bytes, int], _Room] = {}
+        self._rooms: dict[tuple[bytes, int], _GpuMemory] = {}
         self._checked: set[bytes] = set()
         """Programs whose results have been compared with those of the processor."""
         self._lock = threading.RLock()
@@ -144,13 +143,13 @@ class GpuEpisodes:
             launch("advance", lanes, carries, constants, x, action_keys, room.seen, of_lanes, once)
         return kernel.results(carries.read(len(words) - kernel.episode_words)[None], lanes)
 
-    def _room(self, program: _Program, inputs_O: np.ndarray, pairs: int) -> _Room:
+    def _room(self, program: _Program, inputs_O: np.ndarray, pairs: int) -> _GpuMemory:
         """Memory for a number of pairs; that of another number is freed."""
         key = inputs_O.tobytes(), pairs
         if key not in self._rooms:
             self._rooms.clear()
             widest = max(layer.tiles for layer in program.layers) * TILE
-            self._rooms[key] = _Room(
+            self._rooms[key] = _GpuMemory(
                 self._gpu.array((len(program.places), pairs, TILE), np.uint8),
                 self._gpu.array((len(inputs_O), 2 * pairs), np.float32),
                 (self._gpu.array((widest, 2 * pairs), np.float32), self._gpu.array((widest, 2 * pairs), np.float32)),

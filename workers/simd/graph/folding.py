@@ -52,7 +52,7 @@ class FoldingGraph(Graph):
         return key[1] if key[0] == "neg" else None
 
 
-Rule = Callable[[FoldingGraph, tuple[int, ...], list[Any]], int | None]
+FoldingRule = Callable[[FoldingGraph, tuple[int, ...], list[Any]], int | None]
 
 
 def _is(value: Any, number: float) -> bool:
@@ -154,7 +154,7 @@ def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> i
     return g.op("and", mask, a) if g.dtypes[b] == "b" and values[2] is not None and not values[2] else None
 
 
-def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
+def _fold_logic(neutral: bool, absorbing: bool) -> FoldingRule:
     def fold(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
         a, b = args
         for x, value in ((b, values[0]), (a, values[1])):
@@ -185,7 +185,7 @@ def _fold_by_zero_either(g: FoldingGraph, args: tuple[int, ...], values: list[An
     return args[1] if _is(values[0], 0) else _fold_by_zero(g, args, values)
 
 
-RULES: dict[str, Rule] = {
+RULES: dict[str, FoldingRule] = {
     "add": _fold_add,
     "sub": _fold_sub,
     "mul": _fold_mul,

@@ -18,7 +18,7 @@ import numpy as np
 
 from workers.simd.graph.operations import NUMPY_DTYPES, OPERATIONS
 
-Key = tuple
+NodeKey = tuple
 SELECTS = {"f": "select", "i": "iselect", "b": "bselect"}
 """Operation that chooses between two values, by their dtype."""
 
@@ -52,14 +52,14 @@ class Graph:
     """
 
     def __init__(self) -> None:
-        self.keys: list[Key] = []
+        self.keys: list[NodeKey] = []
         self.dtypes: list[str] = []
         self.loops: list[Loop] = []
         self.place: Any = None
         """Where the nodes that are added next come from, as whoever adds them says."""
         self.places: list[Any] = []
         """`place` when each node was added."""
-        self._known: dict[Key, int] = {}
+        self._known: dict[NodeKey, int] = {}
         self._arguments: list[tuple[int, ...]] = []
         """Argument nodes of each node; empty for nodes that are no operations."""
         self._constants: dict[int, Any] = {}
@@ -174,7 +174,7 @@ class Graph:
         """Node of an operation that does not exist yet; only `op` calls this."""
         return self._node((name, *arguments), OPERATIONS[name].gives, arguments)
 
-    def _node(self, key: Key, dtype: str, arguments: tuple[int, ...] = ()) -> int:
+    def _node(self, key: NodeKey, dtype: str, arguments: tuple[int, ...] = ()) -> int:
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = len(self.keys)

@@ -88,7 +88,7 @@ OPERATIONS: dict[str, Operation] = {
     "iand": Operation("ii", "i", np.bitwise_and, "and {I} {0}, {1}", commutes=True),
     "ior": Operation("ii", "i", np.bitwise_or, "or {I} {0}, {1}", commutes=True),
     "ixor": Operation("ii", "i", np.bitwise_xor, "xor {I} {0}, {1}", commutes=True),
-    # Integers are never divided by 0, nor the least integer by -1; division.py ensures this.
+    # Integers are never divided by 0, nor the least integer by -1; elementary.py ensures this.
     "sdiv": Operation("ii", "i", _truncated_quotient, "sdiv {I} {0}, {1}"),
     "srem": Operation("ii", "i", np.fmod, "srem {I} {0}, {1}"),
     "udiv": Operation("ii", "i", lambda a, b: (_unsigned(a) // _unsigned(b)).view(np.int32), "udiv {I} {0}, {1}"),

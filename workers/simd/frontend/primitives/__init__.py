@@ -5,28 +5,6 @@ outputs. `equation` has the primitive's parameters and the types of its inputs a
 UnsupportedError for cases that it does not support.
 """
 
-from workers.simd.frontend.primitives import (
-    arithmetic,
-    choices,
-    control,
-    indexing,
-    linear,
-    random,
-    reductions,
-    sorting,
-    structure,
-)
-from workers.simd.frontend.primitives.registry import PRIMITIVES
+from workers.simd.frontend.primitives import axes, control, elementwise, indexing, linear, random
 
-__all__ = [
-    "PRIMITIVES",
-    "arithmetic",
-    "choices",
-    "control",
-    "indexing",
-    "linear",
-    "random",
-    "reductions",
-    "sorting",
-    "structure",
-]
+__all__ = ["axes", "control", "elementwise", "indexing", "linear", "random"]

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.dtypes import dtype_in
-from workers.simd.frontend.primitives.choices import select
-from workers.simd.frontend.primitives.registry import primitive
-from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.frontend.primitives.elementwise import select
+from workers.simd.frontend.tracer import Nodes, Tracer, dtype_in, primitive
 from workers.simd.graph.unsupported import UnsupportedError
 
 MOST_TRIPS = 10_000

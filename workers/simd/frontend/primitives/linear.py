@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.primitives.registry import primitive
-from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.frontend.tracer import Nodes, Tracer, primitive
 from workers.simd.graph.graph import Graph
 
 Matrix = list[list[int]]

@@ -2,7 +2,7 @@
 
 A key is a pair of nodes (`Graph.pair`). What splitting, folding and drawing do is taken from JAX's own definition of
 the generator, which leaves threefry2x32 alone to be defined here; so bits are JAX's, whatever its settings are. The
-settings belong to the hash of a function (`digest.py`).
+settings belong to the hash of a function (`trace.jaxpr_digest`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jax.extend.random import threefry_prng_impl
 
-from workers.simd.frontend.digest import partitionable
-from workers.simd.frontend.dtypes import graph_dtype
-from workers.simd.frontend.primitives.registry import primitive
-from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.frontend.tracer import Nodes, Tracer, graph_dtype, primitive
 
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = 0x1BD11BDA
@@ -103,3 +100,9 @@ def _of_setting(name: str, dtype: Any, parameters: tuple, shape: tuple[int, ...]
     for _axis in shape:
         function = jax.vmap(function)
     return jax.make_jaxpr(function)(*arguments)
+
+
+def partitionable() -> bool:
+    """JAX's setting that says which of two ways random numbers are made of threefry keys."""
+    config: Any = jax.config
+    return config.jax_threefry_partitionable

@@ -1,1 +1,0 @@
-"""Tables and lines that the commands print."""
