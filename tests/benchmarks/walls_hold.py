@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 EPISODES, BLOCK = 2000, 50
-STEPS = {"ant_maze": 3000, "ant_trap": 1000}
+STEPS = {"ant_maze": 3000, "ant_trap": 1000, "ant_u_maze": 1000, "ant_big_maze": 1000, "ant_hardest_maze": 1000}
 DRIVES = ("random", "full torque")
 RESULTS = Path(__file__).parent / "results" / "walls_hold.csv"
 DEEPEST_M = 0.1
@@ -31,11 +31,12 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
 
     from es_service.protocol.noise import Domain, stream_keys
     from tests.wall_watch import WALLS, colliders, crosses, depth, places_beside_walls
-    from workers.environments import ant_maze, ant_tasks
+    from workers.environments import ant_maze, ant_tasks, goal_cells, goal_maze
     from workers.environments.ant import make_ant
 
     if (name, drive) not in _compiled:
-        walls, ant = WALLS[name], make_ant(WALLS[name])
+        walls = WALLS[name]
+        ant = make_ant(walls, near=goal_maze.WALLS_MET if name in goal_cells.MAZES else None)
 
         def episode(start_key, xy, key):
             def body(step, carry):

@@ -8,9 +8,9 @@ import pytest
 
 from es_service.search.maps.geometry import Grid, make_geometry, reachable_cells
 from tests.es_service.map_examples import SQUARE, map_config
-from workers.environments import ANT_CLEARANCE, SHIPPED, ant_tasks, point_maze
+from workers.environments import SHIPPED, ant_tasks, point_maze
 from workers.environments.ant import TORSO_RADIUS
-from workers.environments.ant_tasks import WALL_RADIUS
+from workers.environments.ant_tasks import ANT_CLEARANCE, WALL_RADIUS
 
 
 def test_coverage_of_reachable_cells_knows_the_border_and_gives_up_on_too_many():

@@ -19,6 +19,7 @@ import numpy as np
 from workers.environments import SHIPPED, Environment, make_environment
 from workers.environments.ant import AntState, expand, load_system, physics_step
 from workers.environments.brax_parts import pipeline
+from workers.environments.walls import wall_rows
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -79,8 +80,9 @@ def substeps_of(task: str) -> Step:
 
 
 def substep(task: str) -> Step:
-    system, walls = system_of(task), SHIPPED[task].walls or ()
-    return lambda state, action: physics_step(system, state, action, walls)
+    system, walls = system_of(task), SHIPPED[task].walls
+    rows = wall_rows(walls) if walls else None
+    return lambda state, action: physics_step(system, state, action, rows)
 
 
 @cache

@@ -25,7 +25,7 @@ def test_threads_that_trace_substeps_wait_for_each_other(monkeypatch: pytest.Mon
     def trace(number: int) -> None:
         together.wait()
         anything: Any = number
-        found[number] = physics_step(anything, anything, anything, ())
+        found[number] = physics_step(anything, anything, anything, None)
 
     started = [threading.Thread(target=trace, args=(number,)) for number in range(threads)]
     for thread in started:

@@ -7,14 +7,14 @@ import pytest
 
 from workers.environments import ant_maze, ant_trap
 from workers.environments.ant_tasks import WALL_RADIUS
-from workers.environments.walls import nearest_wall
+from workers.environments.walls import nearest_wall, wall_rows
 
 RADIUS = 0.08
 ALONG_X = (((0.0, 0.0), (4.0, 0.0)),)
 
 
 def contact(walls, foot, knee, radius=RADIUS):
-    found = nearest_wall(walls, jnp.array(foot, jnp.float32), jnp.array(knee, jnp.float32), radius)
+    found = nearest_wall(wall_rows(walls), jnp.array(foot, jnp.float32), jnp.array(knee, jnp.float32), radius)
     return float(found.distance), np.asarray(found.normal_3), np.asarray(found.position_3)
 
 
@@ -38,7 +38,7 @@ def test_distance_is_the_least_to_any_wall(walls):
     middle = ends[rng.integers(len(ends), size=400)] + rng.normal(size=(400, 2)) * 2.0
     foot = np.concatenate([middle, rng.uniform(0, 0.6, (400, 1))], axis=1)
     knee = foot + np.concatenate([rng.uniform(-0.5, 0.5, (400, 2)), rng.uniform(-0.3, 0.3, (400, 1))], axis=1)
-    found = jax.vmap(lambda f, k: nearest_wall(walls, f, k, RADIUS))(jnp.asarray(foot), jnp.asarray(knee))
+    found = jax.vmap(lambda f, k: nearest_wall(wall_rows(walls), f, k, RADIUS))(jnp.asarray(foot), jnp.asarray(knee))
     checked = 0
     for row in range(400):
         least = least_distance(walls, foot[row], knee[row])

@@ -12,6 +12,8 @@ from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.options import OptionValue, choice
 from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, SUITES, meant_environment
+from workers.environments.ant_tasks import ANT_CLEARANCE
+from workers.environments.goal_cells import MAZES, goal_maze
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -20,11 +22,6 @@ if TYPE_CHECKING:  # it imports this module
     from workers.environments.host_task import HostTask
 
 
-ANT_CLEARANCE = 0.65
-"""Least distance of an ant's torso from the middle of a wall, in metres.
-
-It is half the width of a wall plus the torso's radius, minus the 0.1 m by which a wall may give way.
-"""
 PHYSICS = ("spring", "mujoco")
 """Physics of the ants: Brax's springs, or MuJoCo by MJX."""
 
@@ -86,6 +83,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         least_reward=-3.38,  # QDax's figure for an episode's mean, not a bound for this ant
         summary="an ant is rewarded for running forward; a trap blocks the direct path, so the ant must go round it",
     ),
+    **{name: goal_maze(name) for name in MAZES},
 }
 """Descriptions of the shipped tasks by name. A test compares each with the task's module."""
 
@@ -130,6 +128,8 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
         TaskError: the task does not exist or cannot be used.
     """
     prefix, colon, rest = name.partition(":")
+    if name in MAZES:
+        return importlib.import_module("workers.environments.goal_maze").make(name, **options)
     if not colon:
         return importlib.import_module(f"workers.environments.{name}").make(**options)
     if prefix == "brax":

@@ -34,7 +34,7 @@ from workers.environments.brax_parts import (
     pipeline,
     quietly,
 )
-from workers.environments.walls import Segment, nearest_wall
+from workers.environments.walls import Segment, WallRows, nearest_wall, wall_rows, walls_near
 from workers.viewer import Viewer
 
 SUBSTEPS = 10
@@ -93,9 +93,14 @@ def ant_in(physics: str, walls: tuple[Segment, ...]) -> Ant:
     return ant_mujoco.make_ant(walls)
 
 
-def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
-    """Build the ant of a task. The model shows the walls to viewers only; `walls.py` computes contacts with them."""
-    system = load_system(walls)
+def make_ant(walls: tuple[Segment, ...] = (), near: int | None = None) -> Ant:
+    """Build the ant of a task. The model shows the walls to viewers only; `walls.py` computes contacts with them.
+
+    Args:
+        near: how many walls an ant can meet in a control step, if they are far fewer than all of them: those nearest to
+            its torso when the control step begins. None: all are looked at.
+    """
+    system, rows = load_system(walls), wall_rows(walls) if walls else None
 
     def reset(key: Any, start: tuple[float, float]) -> AntState:
         u = joint_noise(key)
@@ -105,9 +110,11 @@ def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
         return AntState(state.x_i, state.xd_i, q, qd, Motion.zero((system.num_links(),)))
 
     def step(state: AntState, action: Any) -> AntState:
+        met = rows if rows is None or near is None else walls_near(rows, state.q[:2], near)
+
         def substep(_, carry):
             physics, push = carry
-            physics, impulse = physics_step(system, physics, action, walls)
+            physics, impulse = physics_step(system, physics, action, met)
             return physics, push + impulse
 
         none = Motion.zero((system.num_links(),))
@@ -122,8 +129,8 @@ def joint_noise(key: Any) -> Any:
     return (2.0 * uniforms(key, jnp.arange(2 * JOINTS, dtype=jnp.uint32)) - 1.0) * RESET_NOISE
 
 
-def physics_step(system: System, state: State, action: Any, walls: tuple[Segment, ...]) -> tuple[State, Motion]:
-    """One substep of Brax with walls.
+def physics_step(system: System, state: State, action: Any, walls: WallRows | None) -> tuple[State, Motion]:
+    """One substep of Brax with walls, if there are any.
 
     Returns:
         (state, impulse of the contacts on each link [L], about its centre of mass)
@@ -192,11 +199,11 @@ def load_system(walls: tuple[Segment, ...]) -> System:
     return system.tree_replace({"opt.timestep": SUBSTEP_S})
 
 
-def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Contact:
+def _contacts(system: System, x: Transform, walls: WallRows | None) -> Contact:
     """Contacts with the floor, as Brax finds them, followed by one contact with a wall for each collider."""
     floor = brax_contact.get(system, x)
     assert floor is not None
-    if not walls:
+    if walls is None:
         return floor
     feet_3 = [x.pos[TORSO]]
     for link, sign_x, sign_y in LOWER_LEGS:

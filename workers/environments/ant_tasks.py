@@ -14,6 +14,11 @@ FORCE_LIMIT = 1.0
 """Bound of the contact forces in the observation of AntTrap."""
 WALL_RADIUS = 0.5
 """Half the thickness of a wall, in metres."""
+ANT_CLEARANCE = 0.65
+"""Least distance of an ant's torso from the middle of a wall, in metres.
+
+It is half the width of a wall plus the torso's radius, minus the 0.1 m by which a wall may give way.
+"""
 
 MAZE_START = (-25.0, -25.0)
 MAZE_GOAL = (35.0, -25.0)

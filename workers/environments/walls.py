@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,21 +32,55 @@ class WallContact(NamedTuple):
     """Point half-way between the surfaces, at the height of the collider's closest point."""
 
 
-def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: Any) -> WallContact:
+class WallRows(NamedTuple):
+    """Walls as arrays with a row for each."""
+
+    start_W_2: Any
+    end_W_2: Any
+    way_W_2: Any
+    """From the start to the end."""
+    inverse_W: Any
+    """1 / length**2."""
+    root_W: Any
+    """1 / length."""
+    across_W_2: Any
+    """Unit vector to the left of the way."""
+
+
+def wall_rows(walls: tuple[Segment, ...]) -> WallRows:
+    """Walls, given by their ends, as arrays of NumPy."""
+    ends = np.array(walls, np.float32)
+    way_W_2 = ends[:, 1] - ends[:, 0]
+    inverse_W = 1.0 / (way_W_2**2).sum(-1)
+    root_W = np.sqrt(inverse_W)
+    across_W_2 = np.stack([-way_W_2[:, 1], way_W_2[:, 0]], -1) * root_W[:, None]
+    return WallRows(ends[:, 0], ends[:, 1], way_W_2, inverse_W, root_W, across_W_2)
+
+
+def walls_near(walls: WallRows, point_2: Any, count: int) -> WallRows:
+    """The walls whose middle lines are nearest to a point, the nearest first; of equal ones the first in the list.
+
+    An ant that is far from all others meets no other wall in a control step, so colliders need to look at no others.
+    """
+    share_W = jnp.clip(_dot(point_2 - walls.start_W_2, walls.way_W_2) * walls.inverse_W, 0.0, 1.0)
+    offset_W_2 = point_2 - walls.start_W_2 - share_W[:, None] * walls.way_W_2
+    near = jax.lax.top_k(-_dot(offset_W_2, offset_W_2), count)[1]
+    return WallRows(*(jnp.asarray(field)[near] for field in walls))
+
+
+def nearest_wall(walls: WallRows, foot_3: Any, knee_3: Any, radius: Any) -> WallContact:
     """Contact of one collider with the nearest of several walls.
 
     Two segments that do not cross are closest at an end of one of them. If they cross, the gap is minus the distance by
     which the foot has passed the wall, and the normal points to the side of the knee.
 
     Args:
-        walls: ends of each wall.
+        walls: as arrays.
         foot_3, knee_3: ends of the collider's axis; equal for a sphere. Of equally near pairs of points the one at the
             foot is taken, and of equally near walls the first in the list.
         radius: radius of the collider.
     """
-    ends = np.array(walls, np.float32)
-    start_W_2, way_W_2 = ends[:, 0], ends[:, 1] - ends[:, 0]
-    inverse_W = 1.0 / (way_W_2**2).sum(-1)
+    start_W_2, end_W_2, way_W_2, inverse_W, root_W, across_W_2 = walls
     foot_2, knee_2 = foot_3[:2], knee_3[:2]
     leg_2 = knee_2 - foot_2
     inverse_leg = 1.0 / jnp.maximum(_dot(leg_2, leg_2), TINY)
@@ -54,18 +89,17 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     candidates = []
     for point_2, along in ((foot_2, 0.0), (knee_2, 1.0)):
         share_W = jnp.clip(_dot(point_2 - start_W_2, way_W_2) * inverse_W, 0.0, 1.0)
-        candidates.append((point_2 - start_W_2 - share_W[:, None] * way_W_2, jnp.full(len(walls), along)))
-    for end_W_2 in (start_W_2, ends[:, 1]):
-        share_W = jnp.clip(_dot(end_W_2 - foot_2, leg_2) * inverse_leg, 0.0, 1.0)
-        candidates.append((foot_2 + share_W[:, None] * leg_2 - end_W_2, share_W))
+        candidates.append((point_2 - start_W_2 - share_W[:, None] * way_W_2, jnp.full(len(start_W_2), along)))
+    for tip_W_2 in (start_W_2, end_W_2):
+        share_W = jnp.clip(_dot(tip_W_2 - foot_2, leg_2) * inverse_leg, 0.0, 1.0)
+        candidates.append((foot_2 + share_W[:, None] * leg_2 - tip_W_2, share_W))
     square_W, offset_W_2, along_W = least([(_dot(offset, offset), offset, along) for offset, along in candidates])
 
     # The nearest wall is the one with the least square of the gap; the square is negative if the foot has passed it.
     side_foot_W, side_knee_W = _cross(way_W_2, foot_2 - start_W_2), _cross(way_W_2, knee_2 - start_W_2)
-    ends_apart_W = _cross(leg_2, start_W_2 - foot_2) * _cross(leg_2, ends[:, 1] - foot_2) < 0
+    ends_apart_W = _cross(leg_2, start_W_2 - foot_2) * _cross(leg_2, end_W_2 - foot_2) < 0
     crosses_W = (side_foot_W * side_knee_W < 0) & ends_apart_W
-    across_W_2 = np.stack([-way_W_2[:, 1], way_W_2[:, 0]], -1) * np.sqrt(inverse_W)[:, None]
-    through_W = side_foot_W * np.sqrt(inverse_W)
+    through_W = side_foot_W * root_W
     square_W = jnp.where(crosses_W, -through_W * through_W, square_W)
     offset_W_2 = jnp.where(crosses_W[:, None], across_W_2 * jnp.sign(side_knee_W)[:, None], offset_W_2)
     along_W = jnp.where(crosses_W, 0.0, along_W)
