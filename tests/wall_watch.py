@@ -76,7 +76,7 @@ def places_beside_walls(name: str, count: int, seed: int) -> np.ndarray:
     if name == "ant_maze":
         free &= inside_the_maze(tries)
     elif name in goal_cells.MAZES:
-        free &= np.array([goal_cells.is_free(name, xy) for xy in tries])
+        free &= np.array([goal_cells.is_free(name, *xy) for xy in tries])
     chosen = tries[free][:count].astype(np.float32)
     assert len(chosen) == count
     return chosen

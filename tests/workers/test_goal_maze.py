@@ -29,7 +29,7 @@ def free_places(maze: str, step: float = 0.2) -> np.ndarray:
     """Places of a grid in free cells, [N, 2]."""
     (x0, x1), (y0, y1) = bounds_of(maze)
     grid = np.stack(np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step), indexing="ij"), -1).reshape(-1, 2)
-    return grid[[is_free(maze, xy) for xy in grid]]
+    return grid[[is_free(maze, *xy) for xy in grid]]
 
 
 def gaps(places_N_2: np.ndarray, maze: str) -> np.ndarray:

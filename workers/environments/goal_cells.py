@@ -63,10 +63,10 @@ def cells_of(maze: str, mark: str) -> list[tuple[int, int]]:
     return [(i, j) for i, row in enumerate(MAZES[maze]) for j, here in enumerate(row) if here == mark]
 
 
-def is_free(maze: str, xy: Place) -> bool:
+def is_free(maze: str, x: float, y: float) -> bool:
     """Whether a place is in no block."""
     layout = MAZES[maze]
-    i, j = (round(at / CELL_M) for at in xy)
+    i, j = round(x / CELL_M), round(y / CELL_M)
     return 0 <= i < len(layout) and 0 <= j < len(layout[0]) and layout[i][j] != BLOCK
 
 
