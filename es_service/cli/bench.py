@@ -87,7 +87,6 @@ def bench_rollouts(
 
 
 def _options(task: str, overrides: Overrides) -> dict[str, Any]:
-    """Options of a task that overrides give."""
     values, problems = parse_overrides(overrides)
     problems += [problem_of(key, value, f"only {TASK_OPTIONS}NAME can be set here")
                  for key, value in values.items() if not key.startswith(TASK_OPTIONS)]  # fmt: skip

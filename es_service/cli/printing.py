@@ -71,7 +71,6 @@ def settings(values: Mapping[str, Any]) -> list[str]:
 
 
 def way_command(way: WayOut) -> str:
-    """The shell command of a way out."""
     folder, out = way.run or "RUN", ["--out", way.out] if way.out else []
     match way.action:
         case "install":
@@ -119,7 +118,6 @@ def print_finding(level: str, text: str) -> None:
 
 
 def print_error(error: ServiceError | str) -> None:
-    """Print an error message and its ways out."""
     message = error_message(error) if isinstance(error, ServiceError) else error
     print_note(f"error: {message}", style="red")
 
@@ -146,7 +144,6 @@ def print_config_notes(source: Source, configs: Sequence[RunConfig]) -> None:
 
 
 def print_json(value: object) -> None:
-    """Print a value as JSON on stdout."""
     print(json.dumps(_finite(value), indent=1, allow_nan=False))
 
 

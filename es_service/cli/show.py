@@ -67,7 +67,6 @@ def status_data(status: RunStatus) -> dict[str, Any]:
 
 
 def digest_data(parts: Mapping[str, str], *, mixed: bool) -> dict[str, Any]:
-    """What `digest` shows of a run."""
     return {"digest": digest_of(parts), "mixed": mixed, "parts": dict(parts)}
 
 
@@ -263,7 +262,6 @@ def _option(option: Option) -> str:
 
 
 def _value(value: object) -> str:
-    """A value as written in a config."""
     return f"{value:g}" if isinstance(value, float) else show(value)
 
 

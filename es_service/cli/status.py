@@ -209,7 +209,6 @@ def print_certified(console: Console, certified: list[Certified]) -> None:
 
 
 def certified_line(row: Mapping[str, Any]) -> str:
-    """The values of a certified policy in words."""
     chosen = (
         f"first of {row['candidates']:,}" if row["rank"] == 0 else f"number {row['rank'] + 1} of {row['candidates']:,}"
     )

@@ -66,12 +66,10 @@ class Trails:
             self._disc(self._floor, np.array(task.goal), GOAL, 10 * half_pixel)
 
     def begin(self, lane_M: NDArray[np.intp], place_M_2: NDArray) -> None:
-        """Some environments have begun an episode."""
         for lane, place in zip(lane_M.tolist(), place_M_2, strict=True):
             self._ways[lane] = [place.copy()]
 
     def move(self, lane_M: NDArray[np.intp], place_M_2: NDArray) -> None:
-        """Some environments have done a step."""
         for lane, place in zip(lane_M.tolist(), place_M_2, strict=True):
             self._ways[lane].append(place.copy())
 

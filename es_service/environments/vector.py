@@ -224,7 +224,6 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         return None if self._trails is None else tuple(self._trails.frame(lane) for lane in range(self.num_envs))
 
     def close_extras(self, **_: Any) -> None:
-        """End the threads and processes."""
         self._lanes.close()
 
     def _require_open(self) -> None:

@@ -27,10 +27,7 @@ _RESERVED = "/#"
 
 
 class ReadOnly(Mapping[str, Any]):
-    """A mapping that cannot be changed."""
-
     def __init__(self, content: Mapping[str, Any]) -> None:
-        """A mapping with the present content of another one."""
         self._content = dict(content)
 
     def __getitem__(self, key: str) -> Any:

@@ -29,8 +29,6 @@ produce many such entries, and each query near them would visit them all."""
 
 @dataclass(frozen=True)
 class Tree:
-    """A k-d tree over the first entries of an archive."""
-
     kd: KDTree
     entries: int
     """Number of those entries."""
@@ -114,7 +112,6 @@ class NoveltyArchive:
 
     @property
     def size(self) -> int:
-        """Number of entries."""
         return self.generation_N.size
 
 

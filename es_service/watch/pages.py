@@ -57,8 +57,6 @@ def shell(title: str, events: str, base: str = "") -> str:
 
 
 def draw_list(runs: Runs) -> Callable[[], Picture]:
-    """What draws the list of all runs."""
-
     def draw() -> Picture:
         summaries = sorted(runs.summaries(), key=lambda summary: not _is_running(summary))  # these first, else by name
         running = sum(map(_is_running, summaries))

@@ -70,8 +70,6 @@ class RunSummary(NamedTuple):
 
 
 class Runs:
-    """All runs below some folders."""
-
     def __init__(self, roots: Sequence[Path]) -> None:
         self._roots = [root.absolute() for root in roots]
         self._known: dict[str, FoundRun] = {}

@@ -63,7 +63,6 @@ class Site:
         self._replays: dict[tuple[Any, ...], dict[str, Any]] = {}
 
     def app(self, token: str | None) -> Starlette:
-        """The ASGI application."""
         routes = [
             Route("/", self._list),
             Route("/run/{key}", self._run),

@@ -133,7 +133,6 @@ class Blocks:
         return _joined(self._shared("resets", lane_M, keys_M))
 
     def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
-        """Step all lanes."""
         places = zip(self._children, pairwise(self._bounds), strict=True)
         return _joined(self._answers([(child, ("step", action_N_A[slice(*place)])) for child, place in places]))
 
@@ -146,7 +145,6 @@ class Blocks:
         self._shared("put", lane_M, words_M)
 
     def close(self) -> None:
-        """End the processes."""
         for child in self._children:
             child.end()
 

@@ -35,8 +35,6 @@ LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.u
 
 
 class Kernels(NamedTuple):
-    """Compiled functions of a task."""
-
     begin: Kernel | None
     step: Kernel | None
     """None: xla has to compute it, and then the reset too."""
@@ -67,7 +65,6 @@ class CompiledLanes:
         return seen
 
     def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
-        """Step all lanes."""
         self._words[:, self._carry_words :] = pack([action_N_A], self._width)
         if self._pool is None:
             self._step.run(self._words, self._out)
@@ -82,18 +79,14 @@ class CompiledLanes:
         return _by_lane(self._words[:, : self._carry_words])[: self.lanes].copy()
 
     def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
-        """Set the carries of some lanes."""
         self._words[lane_M // self._width, : self._carry_words, lane_M % self._width] = words_M
 
     def close(self) -> None:
-        """End the threads."""
         if self._pool is not None:
             self._pool.shutdown()
 
 
 def compiled_resets(begin: Kernel) -> LaneResets:
-    """The resets of a kernel."""
-
     def resets(lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], LaneResults]:
         keys, width = pack([keys_M], begin.target.width), begin.target.width
         out = aligned((len(keys), begin.words_out, width))

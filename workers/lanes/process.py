@@ -46,7 +46,6 @@ class BlockLanes:
         """Arrays of the carries, [16 * blocks, ...]; those of no lane are some reset."""
 
     def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], LaneResults]:
-        """See `Blocks.resets`."""
         place_M, seen_by_block = self._first + lane_M, []
         for block in np.unique(place_M // BLOCK):
             is_here_M = place_M // BLOCK == block
@@ -62,7 +61,6 @@ class BlockLanes:
         )
 
     def step(self, action_N_A: NDArray[np.float32]) -> LaneResults:
-        """See `Blocks.step`."""
         actions = np.zeros((len(self._arrays[0]), action_N_A.shape[1]), np.float32)
         actions[self._places] = action_N_A
         seen_by_block = []
@@ -75,11 +73,9 @@ class BlockLanes:
         return LaneResults(*(np.concatenate(arrays)[self._places] for arrays in zip(*seen_by_block, strict=True)))
 
     def words(self) -> NDArray[np.uint32]:
-        """See `Blocks.words`."""
         return self._words_of(self._places)
 
     def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
-        """See `Blocks.put`."""
         end = 0
         for kept in self._arrays:
             start, end = end, end + _as_words(kept[:1]).shape[1]

@@ -21,17 +21,14 @@ class Asked(RolloutBackend):
     chunk_pairs = (1, 2**20)
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        """There are none."""
         _refuse()
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
-        """There are none."""
         _refuse()
 
     def random_steps(
         self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
     ) -> Callable[[int], int]:
-        """There are none."""
         _refuse()
 
 

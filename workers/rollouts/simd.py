@@ -52,7 +52,6 @@ class Simd(RolloutBackend):
         return examine(task, options)
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        """The functions of `workers.simd.episodes.rollout`."""
         from workers.rollouts.jax_tasks import judged
         from workers.simd.episodes import low_rank, rollout
 
@@ -79,19 +78,16 @@ class Simd(RolloutBackend):
         return judged(functions, spec)
 
     def device(self) -> str:
-        """The kind of the GPU."""
         from workers.simd.gpu.driver import the_gpu
 
         return the_gpu().name
 
     def made(self, recipes: Recipes) -> FloatArray:
-        """Those of one kernel."""
         from workers.simd.episodes.variation import make_variation
 
         return make_variation()(recipes)
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
-        """Recordings by the kernels of the evaluations."""
         from workers.rollouts.jax_tasks import record
         from workers.simd.episodes.rollout import make_watched_rollout
 
@@ -100,7 +96,6 @@ class Simd(RolloutBackend):
     def random_steps(
         self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
     ) -> Callable[[int], int]:
-        """Steps of one kernel."""
         from workers.rollouts.jax_tasks import random_steps
         from workers.simd.episodes.kernel import compile_kernel
 

@@ -21,13 +21,11 @@ class Xla(RolloutBackend):
     compile_s = (15, 6)
 
     def device(self) -> str:
-        """The kind of JAX's first device."""
         import jax
 
         return jax.devices()[0].device_kind
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        """The functions of `workers.rollout`."""
         from workers import rollout
         from workers.rollouts.jax_tasks import judged
         from workers.scatters import without_scatters
@@ -56,7 +54,6 @@ class Xla(RolloutBackend):
     def random_steps(
         self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
     ) -> Callable[[int], int]:
-        """Steps of one compiled loop."""
         import jax
 
         from workers.rollouts.jax_tasks import random_steps

@@ -77,11 +77,9 @@ class JediSettings(PopulationConfig):
     needs_map = "whose emitters start from elites of the map"
 
     def populations(self) -> int:
-        """One for each emitter."""
         return self.emitters
 
     def spread_keys(self) -> tuple[str, ...]:
-        """The key that makes more populations."""
         return ("search.emitters",)
 
 

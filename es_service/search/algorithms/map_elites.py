@@ -80,11 +80,9 @@ class MapElitesSettings(SearchConfig):
     spread_by = ("search.iso_sigma", "search.line_sigma")
 
     def policies(self) -> int:
-        """A batch."""
         return self.batch
 
     def spread_keys(self) -> tuple[str, ...]:
-        """The key that makes more policies."""
         return ("search.batch",)
 
 

@@ -74,7 +74,6 @@ def extra_of(config: RunConfig, settings: Measured) -> dict[str, Any]:
 
 
 def kept_of(state: SearchState) -> KeptPolicies:
-    """The values of the policies that a search keeps."""
     kept = kept_from_arrays(state.extra[KEPT])
     return kept if state.map is not None and state.map.size else at_rows(kept, NONE)
 
@@ -191,7 +190,6 @@ def _by_serial(kept: KeptPolicies, arrays: Mapping[str, NDArray[np.float64]]) ->
 
 
 def _in_one(samples: Sequence[Samples], dimensions: int) -> dict[str, NDArray[np.float64]]:
-    """The samples of several policies, one after another."""
     fitness, descriptors = zip(*samples, strict=True) if samples else ((), ())
     return {
         FITNESS: np.concatenate([np.zeros(0), *fitness]),

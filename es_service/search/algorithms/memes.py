@@ -145,7 +145,6 @@ def memes(config: RunConfig) -> Algorithm:
 
 
 def emitter_objective(search: MemesSettings, emitter: int) -> Objective:
-    """What an emitter maximises."""
     if search.objectives:
         return search.objectives[emitter % len(search.objectives)]
     explores = emitter % 2 == 0 if search.mode == "explore_exploit" else search.mode == "explore"

@@ -42,7 +42,6 @@ class Method:
     """What it does, in one sentence."""
 
     def __call__(self, config: RunConfig) -> Algorithm:
-        """The algorithm of a run."""
         return self.make(config)
 
 

@@ -119,5 +119,4 @@ class EmittersSettings(PopulationConfig):
         return ("search.emitters",)
 
     def outputs(self) -> tuple[str, ...]:
-        """What the objectives read."""
         return outputs_of(self.objectives or ())

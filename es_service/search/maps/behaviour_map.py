@@ -59,7 +59,6 @@ class BehaviourMap:
 
     @property
     def size(self) -> int:
-        """Number of filled cells."""
         return self.cell_N.size
 
     def row_of(self, cell: int) -> int | None:
@@ -268,7 +267,6 @@ def with_names(
 
 
 def columns_of(map_: BehaviourMap) -> dict[str, np.ndarray]:
-    """The arrays of a map by name."""
     samples = {} if map_.samples_N is None else {"samples_N": map_.samples_N}
     return {"cell_N": map_.cell_N, **{name: getattr(map_, name) for name in COLUMNS}, **samples}
 
@@ -288,7 +286,6 @@ def _offered(map_: BehaviourMap, cell: int, entry: dict[str, Any]) -> tuple[Beha
 
 
 def _with(map_: BehaviourMap, row: int, values: dict[str, Any]) -> BehaviourMap:
-    """The map with other values in an entry."""
     columns = {name: getattr(map_, name).copy() for name in values}
     for name, value in values.items():
         columns[name][row] = value

@@ -42,7 +42,6 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of cells."""
         return math.prod(self.shape)
 
     @cached_property
@@ -96,7 +95,6 @@ class Cvt:
 
     @property
     def size(self) -> int:
-        """Number of cells."""
         return len(self.centroid_C_B)
 
     @property
@@ -147,7 +145,6 @@ def intervals(geometry: Geometry) -> NDArray[np.float64]:
 
 
 def cell_count(config: MapConfig) -> int:
-    """Number of cells that a config specifies."""
     return math.prod(config.cells)
 
 

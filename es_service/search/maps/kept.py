@@ -52,7 +52,6 @@ class KeptPolicies:
 
     @property
     def size(self) -> int:
-        """Number of kept policies."""
         return self.serial_K.size
 
     @property
@@ -77,7 +76,6 @@ def empty_kept(dimensions: int) -> KeptPolicies:
 
 
 def kept_to_arrays(kept: KeptPolicies) -> dict[str, NDArray[Any]]:
-    """The arrays by name."""
     return {name: getattr(kept, name) for name in COLUMNS}
 
 

@@ -107,8 +107,6 @@ def inline(builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], given
 
 
 class Writer:
-    """Writer of a graph's instructions into a function."""
-
     def __init__(
         self,
         builder: FunctionBuilder,
@@ -246,7 +244,6 @@ class Writer:
         return f"splat (i32 {bits})" if dtype == "i" else f"splat (i1 {str(bool(bits)).lower()})"
 
     def load(self, dtype: str, pointer: str, index: str | int) -> str:
-        """Load a value of a dtype from memory and return its name."""
         stored = self.builder.llvm_types["i" if dtype == "b" else dtype]
         loaded = self.builder.load(stored, pointer, index)
         return loaded if dtype != "b" else self.builder.value(f"icmp ne {stored} {loaded}, zeroinitializer")

@@ -86,7 +86,6 @@ class FunctionBuilder:
         self.do(f"store {llvm_type} {value}, ptr {place}, align {self._alignment(llvm_type)}")
 
     def _alignment(self, llvm_type: str) -> int:
-        """Alignment of a type in memory, in bytes."""
         if llvm_type == self.llvm_types["f"] or llvm_type == self.llvm_types["i"]:
             return 4 * self.width
         return 1 if llvm_type.endswith("x i8>") else 4
@@ -100,7 +99,6 @@ class FunctionBuilder:
         return total
 
     def splat(self, scalar: str, dtype: str = "f") -> str:
-        """Vector with a scalar in all lanes."""
         vector = self.llvm_types[dtype]
         first = self.value(f"insertelement {vector} poison, {SCALAR_TYPES[dtype]} {scalar}, i64 0")
         return self.value(f"shufflevector {vector} {first}, {vector} poison, <{self.width} x i32> zeroinitializer")

@@ -95,7 +95,6 @@ def _initialize(*, native: bool) -> None:
 
 
 def code_generator(target: Target) -> llvm.TargetMachine:
-    """Code generator of LLVM for a target."""
     _initialize(native=target.triple == llvm.get_default_triple())
     return llvm.Target.from_triple(target.triple).create_target_machine(
         cpu=target.cpu, features=target.features, opt=2, reloc="pic", codemodel="small", jit=True

@@ -70,8 +70,6 @@ class Pointer(NamedTuple):
 
 
 class StepCall(NamedTuple):
-    """A call of a function in each step."""
-
     function: FunctionBuilder
     pointers: tuple[str, ...]
     """Names of the kernel's pointers that are its arguments."""
@@ -219,7 +217,6 @@ class QuickWriter(Writer):
         return self.operation("unbits", [self.operation("ior", [size, sign])])
 
     def root(self, a: str) -> str:
-        """Root of a."""
         estimate = self.estimate("sqrt", self.number(1.0), a)
         first = self.operation("mul", [a, estimate])
         half = self.operation("mul", [estimate, self.number(0.5)])
@@ -247,7 +244,6 @@ class QuickWriter(Writer):
         return self.builder.call(floats, f"llvm.{which}.v1f32", (floats, a), (floats, b))
 
     def number(self, value: float) -> str:
-        """A constant float."""
         return self.constant("f", struct.unpack("<i", struct.pack("<f", value))[0])
 
     def nothing(self) -> Noted:

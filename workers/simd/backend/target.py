@@ -133,7 +133,6 @@ class Target:
 
     @property
     def processor(self) -> Processor:
-        """The architecture."""
         return PROCESSORS[ISAS[self.isa].architecture]
 
     @property

@@ -71,12 +71,10 @@ def policy(
 
 
 def shared(centre_D: Floats, lanes: int) -> WeightsOf:
-    """The centre's weights for all lanes."""
     return lambda places, last: np.broadcast_to(centre_D[places][:, None], (len(places), lanes))
 
 
 def per_lane(parameters_L_D: Floats) -> WeightsOf:
-    """Weights of each lane's own parameters."""
     return lambda places, last: parameters_L_D[:, places].T
 
 

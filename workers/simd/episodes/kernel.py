@@ -37,8 +37,6 @@ DRAWN = "random numbers of JAX in a reset, which JAX draws itself"
 
 
 class Facts(NamedTuple):
-    """Facts about the compilation of a kernel."""
-
     jaxpr_s: float
     """Seconds of JAX's own tracing, which xla needs as well."""
     computed: int

@@ -53,12 +53,10 @@ def graph_dtype(dtype: Any) -> str:
 
 
 def is_signed(dtype: str) -> bool:
-    """Whether integers of a JAX dtype may be negative."""
     return dtype.startswith("int")
 
 
 def bits_of(dtype: str) -> int:
-    """Number of bits of an integer dtype."""
     return 8 * np.dtype(dtype).itemsize
 
 
@@ -102,8 +100,6 @@ def primitive(*names: str) -> Callable[[PrimitiveRule], PrimitiveRule]:
 
 
 class Place(NamedTuple):
-    """Where an equation comes from."""
-
     source: source_info_util.SourceInfo
     outer: Place | None
     """The equation whose function contains it."""

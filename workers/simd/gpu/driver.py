@@ -52,12 +52,10 @@ class Gpu:
         self.enter()
 
     def enter(self) -> None:
-        """Use the GPU in this thread."""
         self._call("cuCtxSetCurrent", self._context)
 
     @property
     def target(self) -> Target:
-        """Target of functions for it."""
         return target_of("ptx")
 
     def module(self, functions: Sequence[FunctionBuilder]) -> Module:
@@ -90,7 +88,6 @@ class Gpu:
         return GpuArray(self, pointer, tuple(shape), np.dtype(dtype))
 
     def copied(self, array: Any) -> GpuArray:
-        """A copy of an array in the GPU's memory."""
         copy = self.array(array.shape, array.dtype)
         copy.write(array)
         return copy
@@ -129,8 +126,6 @@ class GpuArray:
 
 
 class Module:
-    """Compiled kernels."""
-
     def __init__(self, gpu: Gpu, module: ctypes.c_void_p) -> None:
         self._gpu, self._module = gpu, module
         self._functions: dict[str, ctypes.c_void_p] = {}

@@ -218,12 +218,10 @@ def function_of(
 
 
 def words_in(tree: Any) -> int:
-    """Words of one lane of a pytree of arrays."""
     return sum(map(words_of, jax.tree.leaves(tree)))
 
 
 def noise_functions(target: Target) -> list[FunctionBuilder]:
-    """Functions of the kernel `fill`."""
     places = jax.ShapeDtypeStruct((TILE,), jnp.uint32)
     given = [("keys", KEY), ("places", places)]
     noise = function_of("noise", noise_bytes, given, "noises", target, ["keys", "places", "noises"])

@@ -66,7 +66,6 @@ class Graph:
         """Value of each constant node as a NumPy scalar."""
 
     def const(self, dtype: str, value: float | int | bool) -> int:
-        """Node of a constant."""
         array = np.asarray(value, NUMPY_DTYPES[dtype])
         bits = int(array.view(np.int32)) if dtype == "f" else int(array)
         node = self._node(("const", dtype, bits), dtype)
@@ -74,7 +73,6 @@ class Graph:
         return node
 
     def f(self, value: float) -> int:
-        """Node of a float32 constant."""
         return self.const("f", value)
 
     def i(self, value: int) -> int:

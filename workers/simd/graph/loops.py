@@ -95,7 +95,6 @@ def build_while(
 
 
 def _operations(graph: Graph, nodes: Iterable[int]) -> int:
-    """How many of some nodes are operations."""
     return sum(bool(graph.arguments(node)) for node in nodes)
 
 
@@ -129,7 +128,6 @@ def _reduced(graph: Graph, loop: Loop, body: Body, outs: list[int], inside: set[
 
 
 def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
-    """Results of repeating `body` as straight code."""
     nodes = list(inits)
     for _ in range(trips):
         nodes = body(nodes)

@@ -45,12 +45,10 @@ def _fused(a: Any, b: Any, c: Any) -> Any:
 
 
 def _unsigned(x: Any) -> Any:
-    """Integers as uint32 with the same bits."""
     return np.asarray(x, np.int32).view(np.uint32)
 
 
 def _bits(x: Any) -> Any:
-    """Bits of floats as int32."""
     return np.asarray(x, np.float32).view(np.int32)
 
 
@@ -60,7 +58,6 @@ def _truncated_quotient(a: Any, b: Any) -> Any:
 
 
 def _float(x: Any) -> Any:
-    """Floats with the bits of integers."""
     return np.asarray(x, np.int32).view(np.float32)
 
 
