@@ -37,9 +37,15 @@ from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset
 from es_service.protocol.policies import POLICIES_TOGETHER, slots
 from workers import progress
 from workers.compilable import Compilable
-from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
-from workers.rollouts.backend import ChunkFunctions, Episodes, lane_of
+from workers.rollouts.backend import (
+    ChunkFunctions,
+    Episodes,
+    evaluation_result,
+    lane_of,
+    policies_result,
+    training_result,
+)
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 

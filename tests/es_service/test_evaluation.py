@@ -59,7 +59,7 @@ def run(tmp_path_factory):
 def evaluated(run, monkeypatch, episodes: int, *, every: bool = False, wrong: float | None = None):
     """The statistics of each policy, and the evaluator."""
     made = Invented(wrong)
-    monkeypatch.setattr(evaluation, "inline_engine", lambda *_, **__: contextlib.nullcontext(made))
+    monkeypatch.setattr(evaluation, "engine_here", lambda *_, **__: contextlib.nullcontext(made))
     chosen = evaluation.candidates(run, best=not every, centre=False, cells=(), every=every)
     return list(evaluation.evaluate(run, chosen, episodes)), made
 

@@ -20,8 +20,8 @@ from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import load_config
 from tests.examples.beam import beam
 from tests.helpers import SPEC, centre, random_parameters
+from workers.describe import does_not_repeat
 from workers.environments import TaskError, describe_environment, make_environment
-from workers.host.repeats import does_not_repeat
 from workers.rollouts import BACKENDS
 
 HERE = __name__

@@ -22,7 +22,6 @@ from es_service.config.keys import has_effect
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
-from es_service.runs import session
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
@@ -190,7 +189,7 @@ def test_any_number_order_loss_and_retry_of_workers_gives_the_same_bits(whole, t
             yield engine
         seen.update(transport.seen)
 
-    monkeypatch.setattr(session, "inline_engine", faulty)
+    monkeypatch.setattr("es_service.runs.engine.inline_engine", faulty)
     other = api.run(api.load_config(config_of(name, workers=workers)), tmp_path / "run", on_notice=notices.append).run
     assert digest_parts(other.folder) == digest_parts(run.folder)
     assert set(other.history["workers"]) == {workers}

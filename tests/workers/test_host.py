@@ -34,12 +34,12 @@ from es_service.runs.replay import record
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import host_tasks
+from workers.describe import does_not_repeat
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import EnvironmentPool
 from workers.host.examine import examine
 from workers.host.policies import LanePolicies
-from workers.host.repeats import does_not_repeat
 from workers.host.seeds import KeyedGenerator
 from workers.worker import make_worker
 

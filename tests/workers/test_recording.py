@@ -15,7 +15,7 @@ from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
 from workers import environments
 from workers.environments import SHIPPED
-from workers.recording import record
+from workers.recording import recorder
 from workers.viewer import Viewer, scene
 
 
@@ -57,7 +57,7 @@ def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
         for e in (0, 3):
             request = RecordRequest(centre, spec.seed, ask, episode=16 * chunk + e)
             asked.append((request, found, e, None if e else found.trace_T_B))
-    recordings = record(spec, [request for request, *_ in asked]).recordings
+    recordings = recorder("", spec)([request for request, *_ in asked]).recordings
     for one, (_, evaluated, at, trace_T_B) in zip(recordings, asked, strict=True):
         assert one.returns_T.size == evaluated.steps[at] + 1
         np.testing.assert_array_equal(one.fitness, evaluated.fitness[at])
@@ -73,7 +73,7 @@ def test_a_recording_ends_with_its_episode(monkeypatch, rollout):
     environment = counting_environment([5], poison_after_done=False)
     monkeypatch.setattr(environments, "make_environment", lambda name, options: environment)
     spec = helpers.spec(episode_steps=30, rollout=rollout)
-    [found] = record(spec, [RecordRequest(helpers.centre(helpers.random_parameters()), seed=0)]).recordings
+    [found] = recorder("", spec)([RecordRequest(helpers.centre(helpers.random_parameters()), seed=0)]).recordings
     assert found.returns_T.tolist() == [0, 1, 3, 6, 10, 15]
     assert found.descriptor_T_B[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
     assert found.fitness == 15
@@ -86,7 +86,7 @@ def test_the_poses_of_an_ant_are_those_of_its_links(name):
     size = SHIPPED[name].observation_size
     centre = helpers.centre(helpers.random_parameters(size=spec.policy.parameters), observation_size=size)
     evaluated = helpers.chunk_runner(spec)(centre, EvaluationChunk(1, 0))
-    found = record(spec, [RecordRequest(centre, spec.seed)])
+    found = recorder("", spec)([RecordRequest(centre, spec.seed)])
     [one] = found.recordings
     np.testing.assert_array_equal(one.fitness, evaluated.fitness[0])
     np.testing.assert_array_equal(one.trace_T_B, evaluated.trace_T_B)
