@@ -93,7 +93,8 @@ class WorkerHere(AtTheEnd):
     platforms: frozenset[str] = frozenset()
 
     def __init__(self, run: Callable[[Sequence[Work]], list[ChunkResult]], should_stop: Callable[[], int | None]):
-        self.run, self.should_stop, self.counts = run, should_stop, DispatchCounts(workers=1)
+        self.run, self.should_stop = run, should_stop
+        self.counts = DispatchCounts(workers=1, rollout_s=0.0, cpu_s=0.0)
 
     def wait_for_place(self) -> None:
         """Return at once, since the caller is there."""
@@ -101,7 +102,11 @@ class WorkerHere(AtTheEnd):
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         if (number := self.should_stop()) is not None:
             raise Interrupted(number)
-        return self.run(work)
+        began_s, used_s, before = time.monotonic(), time.process_time(), self.counts
+        results = self.run(work)
+        rollout_s, cpu_s = before.rollout_s + time.monotonic() - began_s, before.cpu_s + time.process_time() - used_s
+        self.counts = replace(before, rollout_s=rollout_s, cpu_s=cpu_s)
+        return results
 
     def close(self) -> None:
         """Leave the caller as it is."""

@@ -186,6 +186,16 @@ class BudgetConfig(Section):
         "starting and compiling, but without a wait for a first place in a cluster, certifications, and the time "
         "between a stop and a resume.",
     )
+    rollout_s: Positive | None = Field(
+        None,
+        description="Seconds in which workers compute, summed over all sessions: without their starting and compiling, "
+        "waits for them, and the time between generations. The generation that reaches it is the last.",
+    )
+    cpu_s: Positive | None = Field(
+        None,
+        description="Seconds of the processors of the driver and of all its workers, starting and compiling included, "
+        "summed over all sessions. The generation that reaches it is the last. Engine inline.",
+    )
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
     target_certified: Number | None = Field(
         None,

@@ -86,6 +86,15 @@ def choices_are_for_objects(config: Values, task: TaskSpec) -> Problems:
             yield not_allowed("task.new_object_each_episode", True, "false", why=why)
 
 
+def times_are_measured(config: Values, task: TaskSpec) -> Problems:
+    if (limit := config["budget.cpu_s"]) is not None and config["compute.engine"] == "ray":
+        why = " with engine ray, whose workers may be on other machines"
+        yield not_allowed("budget.cpu_s", limit, "null", why=why, hint="; budget.rollout_s is measured everywhere")
+    for key in ("budget.rollout_s", "budget.cpu_s"):
+        if (limit := config[key]) is not None and task.kind == CALLER:
+            yield not_allowed(key, limit, "null", why=f" for {task.name}, whose episodes the caller computes")
+
+
 def time_limit_is_for_steps_of_unequal_times(config: Values, task: TaskSpec) -> Problems:
     if (limit := config["task.time_limit_s"]) is not None and task.kind == "jax":
         why = f" for {task.name}, whose steps take equal times"
@@ -402,6 +411,7 @@ RULES: tuple[Rule, ...] = (
     descriptor_fits,
     choices_are_for_objects,
     time_limit_is_for_steps_of_unequal_times,
+    times_are_measured,
     low_rank_noise_needs_matrices,
     callers_episodes,
     output_fits,

@@ -165,7 +165,8 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
         what = f"{chunk} makes {pairs // chunk} small chunks per generation, which is slow"
         warnings.append(f"compute.chunk_pairs: {what}; {hint}")
     budget = config.budget
-    if budget.generations is None and budget.env_steps is None and budget.wall_clock_s is None:
+    ends = (budget.generations, budget.env_steps, budget.wall_clock_s, budget.rollout_s, budget.cpu_s)
+    if all(limit is None for limit in ends):
         targets = {"target_fitness": budget.target_fitness, "target_certified": budget.target_certified}
         named = " or ".join(f"{key} ({target})" for key, target in targets.items() if target is not None)
         warnings.append(

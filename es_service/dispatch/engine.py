@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import os
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import events
+from es_service.dispatch.computing import Computing
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import (
@@ -35,12 +37,15 @@ from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 from es_service.protocol.pieces import pieces_of, together
 from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.system import cpu_seconds
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
 """Events and commands that `logging` reports at level INFO."""
 _OF_ITS_PROCESS = "the session of a run", "end this one: the run goes on in the other"
 """What a process that was forked during a session is told; see `require_same_process`."""
+CPU_S = 0.05
+"""Least time between two looks at the processors' times of all workers."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
 
@@ -92,6 +97,11 @@ class Transport(Protocol):
 
         Before it runs the first chunks of a kind, it compiles for them, and `Compiled` follows.
         """
+        ...
+
+    def process_ids(self) -> Mapping[int, int] | None:
+        """Worker id -> process id, for the workers that are not known to be lost; None if they may be on other
+        machines."""
         ...
 
     def platforms(self) -> frozenset[str]:
@@ -170,6 +180,8 @@ class Engine(Generic[AnyTransport]):
         self._waits = Waits(on_wait, on_compile)
         self._state = initial_state(limits)
         self._phase = 0
+        self._computing = Computing()
+        self._cpu_before_s, self._cpu_known = cpu_seconds(()), (-math.inf, 0.0)
         self.describe: Callable[[Sequence[Work]], str] = lambda work: ""
         """What an error says of a work item whose workers were lost, since these could not name it; a sentence
         without a full stop, or nothing."""
@@ -195,8 +207,21 @@ class Engine(Generic[AnyTransport]):
         """Numbers of workers and of faults so far."""
         state = self._state
         return DispatchCounts(
-            retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted * state.limits.cores
+            retries=state.retries,
+            lost_workers=state.lost_workers,
+            workers=state.wanted * state.limits.cores,
+            rollout_s=self._computing.seconds(time.monotonic()),
+            cpu_s=self._cpu_s(),
         )
+
+    def _cpu_s(self) -> float:
+        """Seconds of processors so far, looked up at most every CPU_S seconds."""
+        processes, now = self.transport.process_ids(), time.monotonic()
+        if processes is None:
+            return math.nan
+        if now >= self._cpu_known[0] + CPU_S:
+            self._cpu_known = now, cpu_seconds(set(processes.values())) - self._cpu_before_s
+        return self._cpu_known[1]
 
     def wait_for_place(self) -> None:
         """Return when a first worker has a place. Work may be given earlier, but then this wait is part of its time.
@@ -240,6 +265,7 @@ class Engine(Generic[AnyTransport]):
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         policies = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
         self._work, self._results = {item_id: together(part, policies) for item_id, part in parts}, {}
+        self._computing.begin({item_id.kind for item_id, _ in parts}, time.monotonic())
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         self._tell_waits()
 
@@ -307,6 +333,7 @@ class Engine(Generic[AnyTransport]):
         """Pass an event to the scheduler and carry out its commands; returns whether it accepted a result."""
         is_late = isinstance(event, events.Tick) and is_waiting(self._state)
         commands = handle(self._state, event, time.monotonic())
+        self._computing.note(event, self._state, time.monotonic())
         if commands or not isinstance(event, events.Tick):
             self._tell(event)
         accepted = False

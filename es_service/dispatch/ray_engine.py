@@ -191,6 +191,10 @@ class Actors:
             return
         self._calls[ref] = Call(worker, "run", item_id, attempt, work)
 
+    def process_ids(self) -> None:
+        """None, since they may be on other machines."""
+        return
+
     def platforms(self) -> frozenset[str]:
         """`machine.platform_text` of each kind of actor that has come up."""
         return frozenset(self._platforms)

@@ -13,16 +13,22 @@ REACHED = {
     "generations": "generation",
     "env_steps": "env_steps",
     "wall_clock_s": "wall_clock_s",
+    "rollout_s": "rollout_s",
+    "cpu_s": "cpu_s",
     "target_fitness": "best_fitness",
 }
 """The column of the history that each key of the budget limits."""
 MOST_DURATIONS = 5
 """Newest generations by whose durations a run judges whether another one can end within `wall_clock_s`."""
+SECONDS = ("rollout_s", "cpu_s")
+"""Keys of budgets of time that end a run after the generation that reaches them."""
 PHASES = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
 """Columns of the history whose sum is the duration of a generation."""
 _REASONS: Mapping[str, Callable[[float], str]] = {
     "generations": lambda limit: f"the budget of {counted(int(limit), 'generation')} is spent",
     "env_steps": lambda limit: f"the budget of {counted(int(limit), 'environment step')} is spent",
+    "rollout_s": lambda limit: f"the budget of {limit:g} seconds of rollouts is spent",
+    "cpu_s": lambda limit: f"the budget of {limit:g} seconds of processors is spent",
     "target_fitness": lambda limit: f"the target fitness {limit:g} is reached",
 }
 
@@ -52,6 +58,9 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequenc
     """
     reached = _reached(limits, row)
     reasons = {key: _REASONS[key](limits[key]) for key in reached if key in _REASONS}
+    for key in reasons.keys() & {"env_steps", *SECONDS}:
+        if over := row[REACHED[key]] - limits[key]:
+            reasons[key] += f", exceeded by {over:,.1f} s" if key in SECONDS else f", exceeded by {over:,.0f}"
     if (limit := limits.get("wall_clock_s")) is not None:
         seconds, least = row["wall_clock_s"], min(recent) if len(recent) > 1 else 0.0
         budget, over = f"the budget of {limit:g} s", f", exceeded by {seconds - limit:.1f} s"
@@ -77,7 +86,7 @@ def only_started(limits: Mapping[str, float], row: Mapping[str, float]) -> bool:
 
 def _reached(limits: Mapping[str, float], row: Mapping[str, float]) -> list[str]:
     """Keys of the limits that are reached."""
-    return [key for key, limit in limits.items() if row[REACHED[key]] >= limit]
+    return [key for key, limit in limits.items() if row.get(REACHED[key], -math.inf) >= limit]
 
 
 def raised(

@@ -80,10 +80,15 @@ def run(
         EvaluationError, StoreError: the run cannot continue; nothing committed is lost.
     """
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
-    state = state or initial_state(search)
+    state = begun = state or initial_state(search)
     reachable = reachable_in(search, state)
     policies = Contents(store.content)
     finished: list[Finished] = []
+
+    def so_far() -> DispatchCounts:
+        """The numbers of this session, to which the times of earlier sessions are added."""
+        now = counts()
+        return replace(now, rollout_s=begun.rollout_s + now.rollout_s, cpu_s=begun.cpu_s + now.cpu_s)
 
     def record() -> str | None:
         """Store and report the generation that is finished, if there is one that is not stored. Returns the reason to
@@ -103,7 +108,7 @@ def run(
         return answer.reason if isinstance(answer, Stop) else None
 
     while (reason := spent(search.config.budget, state)) is None:
-        requests = generation(search, policies, clock, state, counts)
+        requests = generation(search, policies, clock, state, so_far)
         results: Any = None
         try:
             while True:
@@ -147,8 +152,9 @@ def stored_state(store: Stored) -> RunState | None:
     if store.generation is None:
         return None
     rows = store.newest_history(budgets.MOST_DURATIONS)
-    seconds = float(rows[-1]["wall_clock_s"] or 0.0) if rows else 0.0
-    return replace(state_of(store.load(), store.generation, seconds), durations=budgets.durations(rows))
+    seconds = {name: float(rows[-1].get(name) or 0.0) if rows else 0.0 for name in ("wall_clock_s", *budgets.SECONDS)}
+    state = state_of(store.load(), store.generation, seconds.pop("wall_clock_s"))
+    return replace(state, durations=budgets.durations(rows), **seconds)
 
 
 def spent(budget: BudgetConfig, state: RunState) -> str | None:
@@ -167,6 +173,8 @@ def _reached(state: RunState) -> dict[str, float]:
         "generation": state.generation,
         "env_steps": state.env_steps,
         "wall_clock_s": state.wall_clock_s,
+        "rollout_s": state.rollout_s,
+        "cpu_s": state.cpu_s,
         "best_fitness": state.best.fitness,
     }
 
@@ -211,7 +219,8 @@ def generation(
         "workers": now.workers,
     }
     computed = start_cells, members, told, named, novelty_N
-    return finish(state, learned, *computed, correction, faults, search, clock)
+    finished = finish(state, learned, *computed, correction, faults, search, clock)
+    return replace(finished, state=replace(finished.state, rollout_s=now.rollout_s, cpu_s=now.cpu_s))
 
 
 def propose(

@@ -165,6 +165,8 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
         **({"infeasible_members": infeasible} if search.config.search.allow_infeasible else {}),
         **evaluation_columns(table, results_in(told), at, search.task),
         "wall_clock_s": state.wall_clock_s,
+        "rollout_s": or_none(state.rollout_s),
+        "cpu_s": or_none(state.cpu_s),
         "steps_per_second": (state.env_steps - before.env_steps) / finished.seconds,
         **finished.columns,
     }

@@ -117,6 +117,12 @@ _SEARCH_AND_TIMES = (
     Column("seconds_driver", "REAL", False, "everything else on the driver but the store"),
     Column("seconds_store", "REAL", False, "committing the generation before this one"),
 )
+_COSTS = (
+    Column("rollout_s", "REAL", False, "seconds in which workers computed so far, as budget.rollout_s counts them"),
+    Column("cpu_s", "REAL", False, "seconds of all processors so far, as budget.cpu_s counts them; none with Ray"),
+)
+LATER = frozenset(column.name for column in _COSTS)
+"""Columns that runs of versions before 0.27 lack, and that are not stored where they are continued."""
 
 
 def history_columns(
@@ -139,7 +145,7 @@ def history_columns(
     goal, of_map = _GOAL if task.has_goal else (), _MAP if has_map else ()
     corrected = _CORRECTED if has_map and corrects else ()
     infeasible = (_INFEASIBLE,) if allows_infeasible else ()
-    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES)
+    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES, *_COSTS)
 
 
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:

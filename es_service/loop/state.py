@@ -42,6 +42,9 @@ class RunState:
     episodes: int
     wall_clock_s: float
     """Seconds spent so far in all sessions. They are stored only in the history, because they are not deterministic."""
+    rollout_s: float = 0.0
+    cpu_s: float = 0.0
+    """The columns of the history of these names; NaN if they are not known. They are stored only there."""
     durations: tuple[float, ...] = ()
     """`budget.durations` of the newest generations."""
 

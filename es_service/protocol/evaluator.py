@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -33,6 +34,10 @@ class DispatchCounts:
     """Workers that were lost, or stopped because of a fault."""
     workers: int = 0
     """Workers that the evaluator is to keep running."""
+    rollout_s: float = math.nan
+    """Seconds in which workers have computed; NaN if they are not measured."""
+    cpu_s: float = math.nan
+    """Seconds of the processors of this process and of all its workers; NaN if they are not measured."""
 
 
 class Evaluator(Protocol):

@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -105,3 +105,14 @@ def _said(*command: str) -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+def cpu_seconds(processes: Iterable[int]) -> float:
+    """Seconds of processors of this process so far, of its children that have ended, and of some that are running."""
+    ended, tick = resource.getrusage(resource.RUSAGE_CHILDREN), os.sysconf("SC_CLK_TCK")
+    total = time.process_time() + ended.ru_utime + ended.ru_stime
+    for process in processes:
+        with suppress(OSError, ValueError, IndexError):  # it has just ended
+            fields_of = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+            total += (int(fields_of[11]) + int(fields_of[12])) / tick
+    return total

@@ -18,14 +18,12 @@ from es_service.errors import ConfigError
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
 from es_service.report.measures import CERTIFIED, GAP, measures
-from es_service.report.series import Chart, Line
+from es_service.report.series import X_AXES, Chart, Line, axes_of
 from es_service.runs.setting_words import settings_words
 from es_service.runs.sweep_plan import ENVIRONMENT
 
 POINTS = 200
 """Equally spaced points of a curve; the ends of each group are points, too."""
-AXES = ("env_steps", "wall_clock_s")
-"""History columns that groups are compared against."""
 OWN_TO_A_RUN = ("seed", "compute.", RESOURCES)
 """Keys, or beginnings of keys, by which runs are not grouped unless a user says so."""
 
@@ -154,8 +152,17 @@ def _explaining(constants: Sequence[Mapping[str, Any]], differing: Sequence[str]
     return own
 
 
+def common_axes(runs: Sequence[RunData]) -> dict[str, str]:
+    """The costs against which groups are compared: column of the history that all runs have -> label."""
+    return {
+        column: label
+        for column, label in X_AXES.items()
+        if column != "generation" and all(column in axes_of(run.history) for run in runs)
+    }
+
+
 def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.float64]]:
-    """A chart for each measure of all runs, and the places of its points on an axis of AXES, [K].
+    """A chart for each measure of all runs, and the places of its points on an axis, [K].
 
     A curve ends where the first run of its group ends, so that every point is over all of its runs. It is empty if that
     is before another run begins; so every axis has the same charts.
@@ -211,7 +218,7 @@ def common_threshold(runs: Sequence[RunData]) -> float | None:
 def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]:
     """The final values of each group; `threshold`: fitness from which a run counts as solved, None: no run does."""
     summary_list = []
-    value, columns = value_column(runs_of(groups)), (*measures(runs_of(groups)), *AXES)
+    value, columns = value_column(runs_of(groups)), (*measures(runs_of(groups)), *common_axes(runs_of(groups)))
     for group in groups:
         last = {column: np.array([[run.last(column)] for run in group.runs], float) for column in columns}
         intervals = {column: group.interval(y_R_1) for column, y_R_1 in last.items()}

@@ -21,8 +21,6 @@ from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
 from es_service.runs.run_status import state
 
-COSTS = {"env_steps": "million steps", "wall_clock_s": "seconds"}
-"""History column of a cost -> its heading in the table of final values."""
 VALUES = {CERTIFIED: "certified value", "best_fitness": "best fitness"}
 """What `compare.value_column` returns -> its name in a sentence."""
 
@@ -55,7 +53,7 @@ def comparison_sections(
             raise NotInRunError(f"{run.folder} has no finished generation yet; leave it out", run=run.folder)
     groups = compare.grouped(runs, keys)
     threshold = compare.common_threshold(runs) if threshold is None else threshold
-    on_axes = {axis: compare.charts(groups, axis) for axis in compare.AXES}
+    on_axes = {axis: compare.charts(groups, axis) for axis in compare.common_axes(runs)}
     figures, points = [], []
     for number_, _ in enumerate(on_axes["env_steps"][0]):
         chart_on = {axis: (charts[number_], x_K) for axis, (charts, x_K) in on_axes.items()}
@@ -74,7 +72,7 @@ def comparison_sections(
             "Curves",
             tag("p", "Median over the seeds of a group; a shaded region is its interval, explained below the final "
                 f"values. A curve ends where the first of its runs ends. {_seeds(groups)}.", class_="note"),
-            axis_choice({axis: X_AXES[axis] for axis in compare.AXES}),
+            axis_choice(compare.common_axes(runs)),
             tag("div", *figures, class_="charts"),
             id_="curves",
         ),
@@ -122,7 +120,8 @@ def _problems(runs: Sequence[RunData]) -> list[Markup]:
 
 def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
     summaries = compare.summaries(groups, threshold)
-    heads_of = {name: measure.label for name, measure in measures(compare.runs_of(groups)).items()} | COSTS
+    heads_of = {name: measure.label for name, measure in measures(compare.runs_of(groups)).items()}
+    heads_of |= compare.common_axes(compare.runs_of(groups)) | {"env_steps": "million steps"}
     solved = () if threshold is None else (f"reach {number(threshold)}", "million steps until then")
     rows = []
     for summary in summaries:

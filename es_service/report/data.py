@@ -23,7 +23,7 @@ from es_service.protocol.content import as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.report.measures import with_derived
-from es_service.report.series import X_AXES, Columns
+from es_service.report.series import IN_EVERY_RUN, Columns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
 from es_service.runs.folders import group_of
 from es_service.runs.run_status import RunStatus, status_at
@@ -142,7 +142,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     run = Run(folder)
     run.__dict__["meta"] = sound_meta(folder, found.meta)  # it is cached there, and `run.db` itself may be damaged
     history = _floats(found.history)
-    if lacking := [column for column in X_AXES if not np.isfinite(history[column]).all()]:
+    if lacking := [column for column in IN_EVERY_RUN if not np.isfinite(history[column]).all()]:
         raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
     best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
     certified, elsewhere, over_time = _certified(folder, problems)

@@ -140,7 +140,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
         grouped = tag("p", text, class_="note")
     return section(
         "Curves",
-        axis_choice(series.X_AXES),
+        axis_choice(series.axes_of(data.history)),
         tag("div", *figures, class_="charts"),
         grouped,
         id_="curves",

@@ -18,8 +18,16 @@ Columns = Mapping[str, NDArray[np.float64]]
 """Column name -> its values; NaN stands for no value."""
 MOST_POINTS = 300
 """A curve of more generations shows groups of neighbouring ones."""
-X_AXES = {"generation": "generation", "env_steps": "environment steps", "wall_clock_s": "seconds"}
+X_AXES = {
+    "generation": "generation",
+    "env_steps": "environment steps",
+    "wall_clock_s": "seconds",
+    "rollout_s": "seconds of rollouts",
+    "cpu_s": "seconds of processors",
+}
 """History columns that curves can be drawn against -> labels."""
+IN_EVERY_RUN = ("generation", "env_steps", "wall_clock_s")
+"""Those of them that every run has; see `axes_of`."""
 PHASES = {
     "seconds_rollout": "episodes of the population",
     "seconds_gradient": "gradient",
@@ -201,10 +209,19 @@ def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Colum
     return {"exploring": 1.0 - mean_G, "exploiting": mean_G}
 
 
+def axes_of(history: Columns) -> dict[str, str]:
+    """The axes of X_AXES that a run has."""
+    return {
+        column: label
+        for column, label in X_AXES.items()
+        if column in IN_EVERY_RUN or (column in history and np.isfinite(history[column]).all())
+    }
+
+
 def x_axes(history: Columns) -> dict[str, NDArray[np.float64]]:
-    """Values of every axis of X_AXES at the end of each group of generations, [K]."""
+    """Values of every axis of a run at the end of each group of generations, [K]."""
     ends_K = groups(len(history["generation"]))
-    return {column: thinned(history[column], ends_K, "last") for column in X_AXES}
+    return {column: thinned(history[column], ends_K, "last") for column in axes_of(history)}
 
 
 def phase_seconds(history: Columns) -> dict[str, float]:

@@ -21,7 +21,7 @@ from es_service.config.tasks import CALLER, ROLLOUTS, TASKS, task_of
 from es_service.config.text import show
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised
-from es_service.loop.history import Column, evaluated_columns, history_columns
+from es_service.loop.history import LATER, Column, evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import defaults_of
 from es_service.runs.identity import require_unchanged
@@ -154,4 +154,5 @@ def _fits(meta: RunMeta, history: tuple[Column, ...], evaluations: tuple[Column,
     lacking = [column for column in evaluations if column not in meta.evaluation_columns]
     kept = tuple(column for column in evaluations if column not in lacking)
     has_all = not any(column.deterministic for column in lacking)
-    return meta.columns == history and meta.evaluation_columns == kept and has_all
+    expected = tuple(column for column in history if column in meta.columns or column.name not in LATER)
+    return meta.columns == expected and meta.evaluation_columns == kept and has_all

@@ -17,7 +17,7 @@ from es_service.runs.checked_config import load_config
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 
-LIMITS = ("generations", "env_steps", "wall_clock_s")
+LIMITS = ("generations", "env_steps", "wall_clock_s", "rollout_s", "cpu_s")
 """Limits of a budget that are reached in any case."""
 METHOD = next(name for name, method in ALGORITHMS.items() if issubclass(method.settings, CandidatesConfig))
 """The method that starts from several policies of another run."""

@@ -26,6 +26,7 @@ from es_service.dispatch.ray_engine import ray_engine
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
+from es_service.loop.budget import REACHED
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
 from es_service.protocol.episodes import addressed, each
@@ -351,4 +352,4 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
 
 
 def _budget() -> dict[str, Any]:
-    return {"generations": GENERATIONS, "env_steps": None, "wall_clock_s": None, "target_fitness": None}
+    return {**dict.fromkeys(REACHED), "generations": GENERATIONS}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
-from es_service.loop.history import Table
+from es_service.loop.history import LATER, Table
 from es_service.protocol.child import require_same_process
 from es_service.protocol.content import names_in
 from es_service.store import certifications
@@ -184,6 +184,8 @@ class RunStore:
             DatabaseHeldError: another program holds the database. StoreError: the generation is not the next one, the
                 history does not fit the columns, a part names a content that nobody has, or the disk is full.
         """
+        if lacking := LATER - {column.name for column in self.meta.columns}:
+            history = {name: value for name, value in history.items() if name not in lacking}
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
             raise StoreError(f"{self.folder}: cannot store generation {generation}; the next generation is {expected}")

@@ -46,6 +46,9 @@ class AnswersAtOnce:
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
         self._inbox.append(Answer(worker, item_id, attempt, [_RESULT] * len(work)))
 
+    def process_ids(self) -> None:
+        return None
+
     def platforms(self) -> frozenset[str]:
         return frozenset()
 

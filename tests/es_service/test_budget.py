@@ -1,5 +1,7 @@
 """When a budget ends a run, above all one of time, and what is said of it."""
 
+from dataclasses import replace
+
 import pytest
 import yaml
 from typer.testing import CliRunner
@@ -7,9 +9,16 @@ from typer.testing import CliRunner
 from es_service import api
 from es_service import sweep as api_sweep
 from es_service.cli.main import app
+from es_service.dispatch.computing import Computing
+from es_service.dispatch.events import Compiled, Limits, Result, Submit, WorkerLost
+from es_service.dispatch.scheduler_state import initial_state
+from es_service.errors import ConfigError
 from es_service.loop import budget, clock, driver
 from es_service.loop.budget import durations, only_started, spent
+from es_service.loop.history import LATER
 from es_service.runs.run_status import more, read_status, state
+from es_service.store.writer import RunStore
+from tests.run_examples import write_run
 
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 5},
@@ -39,6 +48,74 @@ def row(generation=7, seconds=90.0):
 def test_a_budget_of_time_leaves_out_a_generation_that_cannot_end_in_it(seconds, recent, reason):
     expected = {} if reason is None else {"wall_clock_s": f"the budget of 100 s {reason}"}
     assert spent({"generations": 50, "wall_clock_s": 100.0}, row(seconds=seconds), recent) == expected
+
+
+@pytest.mark.parametrize(
+    ("key", "reached", "reason"),
+    [
+        ("rollout_s", 99.9, None),
+        ("rollout_s", 103.21, "the budget of 100 seconds of rollouts is spent, exceeded by 3.2 s"),
+        ("cpu_s", 100.0, "the budget of 100 seconds of processors is spent"),
+        ("cpu_s", float("nan"), None),  # not measured
+        ("env_steps", 1234, "the budget of 100 environment steps is spent, exceeded by 1,134"),
+    ],
+)
+def test_a_budget_ends_a_run_after_the_generation_that_reaches_it(key, reached, reason):
+    assert spent({key: 100}, {**row(), key: reached}) == ({} if reason is None else {key: reason})
+    assert spent({"rollout_s": 1.0}, row()) == {}, "a run of a version without this column"
+
+
+def test_seconds_of_rollouts_are_those_in_which_workers_compute():
+    """Two workers: the first compiles until 10; then both compute until 15. Later phases need no start."""
+    computing, state = Computing(), initial_state(Limits(workers=2))
+    state.items = {"a": None, "b": None}
+    computing.begin({"TrainingChunk"}, 0.0)
+    computing.note(Submit(()), state, 0.0)
+    assert computing.seconds(9.0) == 0.0
+    computing.note(Compiled(0, "TrainingChunk", 10.0), state, 10.0)
+    computing.note(Compiled(1, "TrainingChunk", 12.0), state, 12.0)
+    assert computing.seconds(13.0) == 3.0
+    state.items = {}
+    computing.note(Result(0, "a", 1), state, 15.0)
+    assert computing.seconds(100.0) == 5.0  # between generations
+    state.items = {"c": None}
+    computing.begin({"TrainingChunk"}, 100.0)
+    computing.note(Submit(()), state, 100.0)
+    assert computing.seconds(101.0) == 6.0
+    computing.note(WorkerLost(0, "gone"), state, 102.0)  # none is left, and the next one starts and compiles
+    assert computing.seconds(150.0) == 7.0
+    computing.note(Compiled(2, "TrainingChunk", 5.0), state, 160.0)
+    assert computing.seconds(161.0) == 8.0
+
+
+def test_runs_are_measured_across_sessions_and_end_by_what_they_have_used(tmp_path):
+    settings = {"budget": {"generations": 3}, "task": {**CONFIG["task"], "episode_steps": 50}}
+    api.run(api.load_config(CONFIG | settings), tmp_path / "run")
+    first = api.open_run(tmp_path / "run").history
+    assert (first[["rollout_s", "cpu_s"]].diff().iloc[1:] >= 0).all(axis=None)
+    assert 0 < first.rollout_s.iloc[-1] <= first.wall_clock_s.iloc[-1]
+    used = float(first.rollout_s.iloc[-1])
+    api.resume(tmp_path / "run", {"budget.generations": None, "budget.rollout_s": used + 0.02})
+    later = api.open_run(tmp_path / "run").history
+    assert later.rollout_s.iloc[-2] < used + 0.02 <= later.rollout_s.iloc[-1]
+    assert later.cpu_s.iloc[-1] >= first.cpu_s.iloc[-1]
+
+
+def test_a_run_without_the_columns_of_later_versions_goes_on_without_them(tmp_path):
+    folder = write_run(tmp_path / "run", generations=2)
+    meta = api.open_run(folder).meta
+    assert {"rollout_s", "cpu_s"} <= {column.name for column in meta.columns}
+    older = replace(meta, columns=tuple(column for column in meta.columns if column.name not in LATER))
+    RunStore.create(tmp_path / "older", "", older).close()
+    with RunStore.open(tmp_path / "older") as store:
+        names = {column.name for column in meta.columns}
+        store.commit(0, {}, dict.fromkeys(names - {"generation"}))
+        assert "rollout_s" not in store.last_history()
+
+
+def test_processors_of_other_machines_are_not_measured():
+    with pytest.raises(ConfigError, match=r"budget.cpu_s: 5.* with engine ray"):
+        api.load_config(CONFIG, ["budget.cpu_s=5", "compute.engine=ray"])
 
 
 def test_a_run_with_time_for_nothing_but_its_start_has_only_started():

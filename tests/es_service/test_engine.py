@@ -80,6 +80,9 @@ class Scripted:
             self.inbox.append(Compiled(worker, item_id.kind, 0.0))
         self.on_send(self.sent[-1])
 
+    def process_ids(self) -> None:
+        return None
+
     def shortage(self) -> str:
         return ""
 

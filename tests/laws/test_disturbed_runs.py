@@ -125,6 +125,9 @@ class FaultyWorkers:
         self.running = [one for one in self.running if one[0] != worker]
         return ""
 
+    def process_ids(self) -> None:
+        return None
+
     def platforms(self) -> frozenset[str]:
         return frozenset()
 
