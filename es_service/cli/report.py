@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -52,6 +52,18 @@ def report(
     paired: Annotated[
         bool, typer.Option("--paired", help="Test groups of compared runs by pairs of equal seeds.")
     ] = False,
+    bounds: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--bounds",
+            metavar="TASK=LOW,HIGH",
+            help="Compare runs of several tasks: fitness of a task that counts as 0 and as 1; for each of them.",
+        ),
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option("--label", metavar="GROUP=TEXT", help="Show a group under another name; can be repeated."),
+    ] = None,
     statistics: Annotated[
         Path | None,
         typer.Option(
@@ -70,7 +82,8 @@ def report(
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")
         if out is None and len(folders) > 1:
             raise ConfigError("a comparison of runs belongs to none of their folders; add --out FILE")
-        _compare(folders, out or folders[0] / REPORT, group_by or (), threshold, figures, paired, statistics)
+        how = _How(group_by or (), threshold, figures, paired, statistics, bounds_of(bounds or ()), label or ())
+        _compare(folders, out or folders[0] / REPORT, how)
         return
     if group_by or threshold is not None or paired or statistics:
         print_note("note: --group-by, --threshold, --paired and --statistics have no effect with one run")
@@ -93,17 +106,35 @@ def report(
         print(file)
 
 
-def _compare(
-    folders: Sequence[Path],
-    out: Path,
-    group_by: Sequence[str],
-    threshold: float | None,
-    figures: Path | None,
-    paired: bool,
-    statistics: Path | None,
-) -> None:
+def bounds_of(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Bounds by task, from words such as "point_maze=-130,-25"."""
+    found = {}
+    for word in words:
+        task, _, ends = word.rpartition("=")
+        try:
+            low, high = map(float, ends.split(","))
+            found[task] = low, high
+        except ValueError:
+            what = f"--bounds {word}: write TASK=LOW,HIGH, such as point_maze=-130,-25"
+            raise ConfigError(what, field="bounds", value=word) from None
+    return found
+
+
+class _How(NamedTuple):
+    """Options of a comparison."""
+
+    group_by: Sequence[str]
+    threshold: float | None
+    figures: Path | None
+    paired: bool
+    statistics: Path | None
+    bounds: dict[str, tuple[float, float]]
+    labels: Sequence[str]
+
+
+def _compare(folders: Sequence[Path], out: Path, how: _How) -> None:
     """Write the comparison of all runs with a finished generation; exit with code 1 if a run cannot be read."""
-    from es_service.report.compare import swept_keys
+    from es_service.report.compare import GROUP, labelled, normalised, swept_keys
     from es_service.report.write import read_compared, write_comparison
 
     problems: list[dict[str, str]] = []
@@ -115,13 +146,23 @@ def _compare(
             else:
                 print_note(f"note: {folder} is left out, since it has no finished generation yet")
 
-    runs = list(comparable())
-    if len(folders) == 1 and not group_by:
+    runs, group_by = normalised(list(comparable()), how.bounds), how.group_by
+    if len(folders) == 1 and not group_by and not all(run.group for run in runs):
         group_by = swept_keys(runs)
-    for file in write_comparison(runs, out, group_by, threshold, figures, paired=paired, statistics=statistics):
+    if how.labels:
+        runs, group_by = labelled(runs, group_by, dict(_pair(word) for word in how.labels)), GROUP
+    given = {"paired": how.paired, "statistics": how.statistics}
+    for file in write_comparison(runs, out, group_by, how.threshold, how.figures, **given):
         print(file)
     if problems:
         raise typer.Exit(1)
+
+
+def _pair(word: str) -> tuple[str, str]:
+    name, equals, text = word.rpartition("=")
+    if not equals or not text:
+        raise ConfigError(f"--label {word}: write GROUP=TEXT", field="label", value=word)
+    return name.strip(), text.strip()
 
 
 def export(

@@ -88,13 +88,14 @@ def compared(groups: Sequence[Group], threshold: float | None = None, *, paired:
     found = []
     for name, (measure, value) in _measures(groups, threshold).items():
         values_R = _values(groups, value)
-        if any(np.isnan(of_group).any() for of_group in values_R):
+        if any(np.isnan(np.concatenate(of_group)).any() for of_group in values_R):
             continue
         sign = -1.0 if measure.less_is_better else 1.0
         averages = tuple(_average(group, of_group) for group, of_group in zip(groups, values_R, strict=True))
         places = list(combinations(range(len(groups)), 2))
         differences = [
-            statistics.difference([sign * values_R[i]], [sign * values_R[j]], paired=paired) for i, j in places
+            statistics.difference(*([sign * task_R for task_R in values_R[k]] for k in pair), paired=paired)
+            for pair in places
         ]
         corrected = statistics.holm([difference.p for difference in differences])
         pairs = tuple(
@@ -105,22 +106,23 @@ def compared(groups: Sequence[Group], threshold: float | None = None, *, paired:
     return found
 
 
-def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[NDArray[np.float64]]]:
-    """A measure of each run: (title, -1 if less is better or else 1, values [R] of each group in the order of seeds).
+def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[list[NDArray[np.float64]]]]:
+    """A measure of each run: (title, -1 if less is better or else 1, values of each group). They are [R] of each task,
+    in the order of seeds.
 
     Raises ConfigError if there is no such measure, or if a run lacks it.
     """
     known = _measures(groups, None)
     measure, value = known.get(name, (Measure("", "", ""), lambda _: np.nan))
     found = _values(groups, value)
-    if any(np.isnan(of_group).any() for of_group in found):
+    if any(np.isnan(np.concatenate(of_group)).any() for of_group in found):
         raise ConfigError(f"{name} is no measure that all runs have", value=name, allowed=", ".join(known))
     return measure.label, -1.0 if measure.less_is_better else 1.0, found
 
 
-def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[NDArray[np.float64]]:
-    ordered = [sorted(group.runs, key=lambda run: run.constants["seed"]) for group in groups]
-    return [np.array([value(run) for run in runs], float) for runs in ordered]
+def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[list[NDArray[np.float64]]]:
+    """The values of each group: [R] of each task."""
+    return [[np.array([value(run) for run in runs], float) for runs in group.tasks.values()] for group in groups]
 
 
 def _measures(
@@ -143,28 +145,29 @@ def _last(column: str) -> Callable[[RunData], float]:
     return lambda run: run.last(column)
 
 
-def _average(group: Group, values_R: NDArray[np.float64]) -> Average:
-    independent = group.seeds == len(group.runs)
-    is_finite = bool(np.isfinite(values_R).all())
+def _average(group: Group, values_R: list[NDArray[np.float64]]) -> Average:
+    is_finite = bool(np.isfinite(np.concatenate(values_R)).all())
 
     def known(measure: statistics.Measure) -> Ends | None:
-        return statistics.interval(measure, [values_R]) if independent else None
+        return statistics.interval(measure, values_R) if group.are_independent else None
 
     return Average(
         group.name,
-        len(values_R),
-        float(statistics.median([values_R])),
+        len(group.runs),
+        float(statistics.median(values_R)),
         known(statistics.median),
-        float(statistics.iqm([values_R])) if is_finite else None,
+        float(statistics.iqm(values_R)) if is_finite else None,
         known(statistics.iqm) if is_finite else None,
     )
 
 
 def _require_pairs(groups: Sequence[Group]) -> None:
-    seeds = {group.name: sorted(run.constants["seed"] for run in group.runs) for group in groups}
+    seeds = {
+        group.name: [run.constants["seed"] for of_task in group.tasks.values() for run in of_task] for group in groups
+    }
     first, *others = seeds.items()
     for name, of_group in [first, *others]:
-        if of_group != first[1] or len(set(of_group)) < len(of_group):
+        if of_group != first[1] or not all(group.are_independent for group in groups):
             raise ConfigError(
                 f"runs cannot be paired by their seeds: {first[0]} has the seeds {first[1]}, {name} has {of_group}; "
                 "give each group one run with each seed, or leave pairs out",
@@ -237,6 +240,8 @@ def _explained(groups: Sequence[Group], paired: bool) -> str:
         "The difference is the median of the differences between their runs.",
         f"p is two-sided, from {test}, and corrected by Holm's method for all pairs of groups.",
     ]
+    if len(groups[0].tasks) > 1:
+        said.append("Runs are drawn, compared and shared out within each task, and results averaged over tasks.")
     if not paired:
         said.append("Runs count as independent, also where groups have the same seeds.")
     if len(groups) > 2:
@@ -244,7 +249,7 @@ def _explained(groups: Sequence[Group], paired: bool) -> str:
             "Whoever calls the first of several groups the best has chosen it by these values, which are then too high "
             "on the average; new seeds tell its value."
         )
-    if repeated := [group.name for group in groups if group.seeds < len(group.runs)]:
+    if repeated := [group.name for group in groups if not group.are_independent]:
         said.append(
             f"Several runs have the same seed in {', '.join(repeated)}: they are not independent, and p is wrong."
         )

@@ -6,6 +6,7 @@ Axes: R runs of a group, K points of a curve.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +16,10 @@ from es_service.config.parts import RESOURCES
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.text import did_you_mean, in_line, nearest
 from es_service.errors import ConfigError
+from es_service.report import statistics
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
-from es_service.report.measures import CERTIFIED, GAP, measures
+from es_service.report.measures import CERTIFIED, GAP, SUCCESS, measures
 from es_service.report.series import X_AXES, Chart, Line, axes_of
 from es_service.runs.setting_words import settings_words
 from es_service.runs.sweep_plan import ENVIRONMENT
@@ -39,12 +41,31 @@ class Group(NamedTuple):
         """Number of different seeds among the runs."""
         return len({run.constants["seed"] for run in self.runs})
 
+    @property
+    def tasks(self) -> dict[str, list[RunData]]:
+        """Task -> its runs, in the order of their seeds."""
+        names = sorted({run.constants[ENVIRONMENT] for run in self.runs})
+        by_seed = sorted(self.runs, key=lambda run: run.constants["seed"])
+        return {name: [run for run in by_seed if run.constants[ENVIRONMENT] == name] for name in names}
+
+    @property
+    def are_independent(self) -> bool:
+        """Whether no two runs of a task have the same seed."""
+        return len({(run.constants[ENVIRONMENT], run.constants["seed"]) for run in self.runs}) == len(self.runs)
+
     def interval(self, y_R_K: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Interval of the median over the runs at each point, [2, K]; None if there are no two seeds.
 
-        It is also None if two runs have the same seed, since their results do not vary independently.
+        It is also None if two runs have the same seed, since their results do not vary independently. Over several
+        tasks, runs are drawn within each of them, and curves of many points have none, since this takes long.
         """
-        return median_interval(y_R_K) if 1 < self.seeds == len(self.runs) else None
+        if self.seeds < 2 or not self.are_independent:
+            return None
+        if len(self.tasks) == 1:
+            return median_interval(y_R_K)
+        task_R = np.array([run.constants[ENVIRONMENT] for run in self.runs])
+        drawn = statistics.interval(statistics.median, [y_R_K[task_R == task, 0] for task in self.tasks])
+        return None if drawn is None or y_R_K.shape[1] > 1 else np.array(drawn)[:, None]
 
 
 class Quartiles(NamedTuple):
@@ -83,7 +104,7 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
     """
     constants = [run.constants for run in runs]
     known = sorted({key for settings in constants for key in settings})
-    for key in keys:
+    for key in keys if keys != GROUP else ():
         if key not in known:
             raise ConfigError(
                 f"the runs cannot be grouped by {key}: no run has this setting{did_you_mean(key, known)}",
@@ -91,8 +112,16 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
                 value=key,
                 suggestion=nearest(key, known),
             )
-    differing = [key for key in known if len({in_line(settings.get(key)) for settings in constants}) > 1]
-    are_named = not keys and all(run.group for run in runs) and len({run.folder.parent for run in runs}) == 1
+    tasks = {settings[ENVIRONMENT] for settings in constants}
+    differing = [
+        key
+        for key in known
+        if any(len({in_line(one.get(key)) for one in constants if one[ENVIRONMENT] == task}) > 1 for task in tasks)
+    ]
+    if len(tasks) > 1 and not all(run.bounds_of_fitness for run in runs):
+        _refuse_other_tasks(runs, [ENVIRONMENT])
+    of_one_sweep = all(run.group for run in runs) and len({run.folder.parent for run in runs}) == 1
+    are_named = keys == GROUP or (not keys and of_one_sweep)
     allowed = {*keys, *(differing if are_named else ())} - {ENVIRONMENT}
     _refuse_other_tasks(runs, [key for key in differing if key not in allowed])
     chosen = list(keys) or _explaining(constants, differing)
@@ -102,8 +131,51 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
         name = run.group if are_named else settings_words(settings)
         groups.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
     found = [Group(name, tuple(members)) for name, members in groups.items()]
+    for group in found:
+        if lacking := tasks - group.tasks.keys():
+            raise ConfigError(
+                f"{group.name} has no run of {', '.join(sorted(lacking))}; over several tasks, each group must have "
+                "runs of all of them",
+                field=ENVIRONMENT,
+                value=sorted(group.tasks),
+            )
     if value_column(runs) == CERTIFIED:
         found.sort(key=lambda group: -np.median([run.last(CERTIFIED) for run in group.runs]))
+    return found
+
+
+GROUP = ("group",)
+"""In the place of config keys: runs are grouped by the names of groups that they have, see `labelled`."""
+NORMALISED = (CERTIFIED, "best_fitness")
+SAME_IN_ALL_TASKS = (*X_AXES, SUCCESS, "coverage", "corrected_coverage")
+
+
+def normalised(runs: Sequence[RunData], bounds: Mapping[str, tuple[float, float]]) -> list[RunData]:
+    """Runs that can be compared over several tasks: their fitness is its share of the way between two bounds. What
+    depends on the task otherwise is left out, and so are the maps.
+
+    Args:
+        bounds: task -> fitness that counts as 0 and as 1. None: the runs remain as they are.
+
+    Raises ConfigError for a task that has no bounds, or equal ones.
+    """
+    if not bounds:
+        return list(runs)
+    found = []
+    for run in runs:
+        low, high = bounds.get(task := run.constants[ENVIRONMENT], (0.0, 0.0))
+        if low == high:
+            raise ConfigError(
+                f"bounds: {task} has {'equal ones' if task in bounds else 'none'}; name the fitness that counts as 0 "
+                f"and as 1, such as {task}=-130,-25",
+                field="bounds",
+                value=bounds.get(task),
+            )
+        history = {name: run.history[name] for name in SAME_IN_ALL_TASKS if name in run.history}
+        history |= {name: (run.history[name] - low) / (high - low) for name in NORMALISED if name in run.history}
+        if GAP in run.history:
+            history[GAP] = run.history[GAP] / (high - low)
+        found.append(replace(run, history=history, map=None, bounds_of_fitness=(low, high)))
     return found
 
 
@@ -115,6 +187,27 @@ def value_column(runs: Sequence[RunData]) -> str:
 def runs_of(groups: Sequence[Group]) -> list[RunData]:
     """The runs of all groups."""
     return [run for group in groups for run in group.runs]
+
+
+def labelled(runs: Sequence[RunData], keys: Sequence[str], labels: Mapping[str, str]) -> list[RunData]:
+    """Runs that know their groups under other names, which `GROUP` groups.
+
+    Args:
+        labels: name of a group -> what is shown.
+
+    Raises ConfigError if there is no such group.
+    """
+    groups = grouped(runs, keys)
+    names = [group.name for group in groups]
+    for name in labels:
+        if name not in names:
+            raise ConfigError(
+                f"label: there is no group {name}{did_you_mean(name, names)}; the groups are {', '.join(names)}",
+                field="label",
+                value=name,
+                suggestion=nearest(name, names),
+            )
+    return [replace(run, group=labels.get(group.name, group.name)) for group in groups for run in group.runs]
 
 
 def swept_keys(runs: Sequence[RunData]) -> list[str]:
@@ -132,7 +225,9 @@ def _refuse_other_tasks(runs: Sequence[RunData], differing: Sequence[str]) -> No
             values = {in_line(run.constants.get(key)): run for run in reversed(runs)}
             shown = "; ".join(f"{run.folder} has {value}" for value, run in reversed(values.items()))
             ways = "compare runs of one task"
-            if key != ENVIRONMENT:
+            if key == ENVIRONMENT:
+                ways += ", or name for each of them the fitness that counts as 0 and as 1, such as point_maze=-130,-25"
+            else:
                 ways += f", or group by {key}"
             raise ConfigError(
                 f"these runs cannot be compared, because {key} differs: {shown}; {ways}", field=key, value=list(values)

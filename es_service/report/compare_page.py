@@ -64,7 +64,7 @@ def comparison_sections(
         }
         figures.append(figure)
         points.append({"axes": axes, "texts": texts})
-    task = runs[0].constants["task.environment"]
+    task = ", ".join(groups[0].tasks)
     said = tag("p", _sentence(groups, threshold), class_="verdict")
     sections = {
         "what": tag("section", said, *_problems(runs), id="what"),
@@ -143,8 +143,8 @@ def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
 def _about_intervals(groups: Sequence[Group]) -> str:
     """What the numbers of the table are, and how far they can be trusted with so many seeds."""
     said = ["Median over the seeds of a group; below it, its interval, and the first to the third quartile."]
-    few = sorted({group.seeds for group in groups if 1 < group.seeds <= WHOLE_RANGE})
-    if any(1 < group.seeds == len(group.runs) for group in groups):
+    few = sorted({group.seeds for group in groups if 1 < group.seeds <= WHOLE_RANGE and len(group.tasks) == 1})
+    if any(group.seeds > 1 and group.are_independent for group in groups) and len(groups[0].tasks) == 1:
         said.append(
             "The interval is the percentile bootstrap of the median: the middle 95 % of the medians of all ways to "
             "draw the seeds anew, with repetitions. They are counted and not sampled, so nothing about it is random."
@@ -154,9 +154,15 @@ def _about_intervals(groups: Sequence[Group]) -> str:
         f"seeds between them with a probability of {100 * coverage(seeds):.0f} %, not 95 %."
         for seeds in few
     ]
+    if len(groups[0].tasks) > 1:
+        shares = sorted({f"{run.constants['task.environment']} {run.bounds_of_fitness}" for run in groups[0].runs})
+        said.append(
+            "Fitness is a share of the way between the bounds of each task, which count as 0 and as 1: "
+            f"{', '.join(shares)}. Intervals draw runs within each task; curves have none."
+        )
     if alone := [group.name for group in groups if group.seeds == 1]:
         said.append(f"A group with one seed has no interval: {', '.join(alone)}.")
-    if repeated := [group.name for group in groups if 1 < group.seeds < len(group.runs)]:
+    if repeated := [group.name for group in groups if group.seeds > 1 and not group.are_independent]:
         said.append(f"A group in which several runs have the same seed has no interval: {', '.join(repeated)}.")
     return " ".join(said)
 

@@ -67,6 +67,8 @@ class RunData:
     """What is damaged, one sentence each."""
     group: str = ""
     """Name of the group to which its sweep counts it; empty if there is none."""
+    bounds_of_fitness: tuple[float, float] | None = None
+    """Fitness that counts as 0 and as 1, if its columns are such shares; see `compare.normalised`."""
     best_parameters: Mapping[str, float] = field(default_factory=dict)
     """Parameters of the best centre by name, if the task is a function of them."""
 

@@ -67,7 +67,8 @@ def write_figures(
                 drawings["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
         drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
     else:
-        drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
+        if len({run.constants["task.environment"] for run in runs}) == 1:
+            drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
         drawings["profile"] = lambda figure: plots.profile(list(runs), figure.subplots(), group_by=keys)
         groups = compare.grouped(runs, keys)
         if len(mapped) == len(runs):

@@ -205,11 +205,11 @@ def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: 
     """
     groups = compare.grouped([_data(source) for source in runs], group_by)
     title, sign, values = between.values(groups, measure)
-    place_K = np.unique(np.concatenate(values))
+    place_K = np.unique(np.concatenate([task_R for of_group in values for task_R in of_group]))
     place_K = place_K[np.isfinite(place_K)]
     for index, (group, values_R) in enumerate(zip(groups, values, strict=True)):
         style = _style(index)
-        signed, sign_K = [sign * values_R], sign * place_K
+        signed, sign_K = [sign * task_R for task_R in values_R], sign * place_K
         steps: dict[str, Any] = {"step": "pre" if sign > 0 else "post"}
         axes.step(place_K, statistics.profile(signed, sign_K), where=steps["step"], label=group.name, **style)
         if (ends_2_K := statistics.profile_interval(signed, sign_K)) is not None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.protocol.system import given_path
@@ -90,8 +91,9 @@ def write_comparison(
     *,
     paired: bool = False,
     statistics: AnyPath | None = None,
+    bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the page that compares runs of one task and return the files written, the page first.
+    """Write the page that compares runs and return the files written, the page first.
 
     Args:
         folders: those of the runs; a run that is read already can stand for its folder.
@@ -101,6 +103,8 @@ def write_comparison(
         paired: whether tests compare runs with equal seeds; otherwise all runs are independent.
         statistics: file to write the statistics between groups into, by its name as JSON, CSV or LaTeX (.json, .csv,
             .tex); None: none is written.
+        bounds: task -> fitness that counts as 0 and as 1; with them, runs of several tasks can be compared, of which
+            each group must have all.
 
     Raises:
         ConfigError: the runs cannot be compared, grouped or paired, the file of statistics has another ending, or
@@ -111,7 +115,8 @@ def write_comparison(
         empty_figure()  # a missing matplotlib is reported before anything is read
     kind = "" if statistics is None else between.checked_kind(given_path(statistics))
     read = (run if isinstance(run, RunData) else read_compared(given_path(run)) for run in folders)
-    different = list({run.folder.resolve(): run for run in read}.values())  # a run that is given twice counts once
+    # A run that is given twice counts once.
+    different = compare.normalised(list({run.folder.resolve(): run for run in read}.values()), bounds)
     written = [write_page(comparison_page(different, group_by, threshold, paired=paired), given_path(out))]
     if statistics is not None:
         groups = compare.grouped(different, group_by)

@@ -14,6 +14,7 @@ import pytest
 from scipy import stats
 
 from es_service import plots
+from es_service.cli.report import bounds_of
 from es_service.errors import ConfigError
 from es_service.report import between, compare, statistics
 from es_service.report.bootstrap import median_interval
@@ -242,6 +243,51 @@ def test_groups_are_judged_by_certified_values_if_all_have_one(runs):
     one_left = [*all_certified[:-1], runs[-1]]
     assert [group.name for group in compare.grouped(one_left)] == ["es", "me_es"]
     assert "highest median of the best fitness" in words(comparison_page(one_left))
+
+
+def on_task(run, task, shift):
+    """The same run on another task, where its fitness is ten times as much and shifted."""
+    history = {**run.history, "best_fitness": 10.0 * run.history["best_fitness"] + shift}
+    constants = {**run.constants, "task.environment": task, "task.episode_steps": 7}
+    return replace(run, history=history, meta=replace(run.meta, constants=constants))
+
+
+def test_runs_of_several_tasks_are_compared_by_shares_of_the_way_between_bounds(runs):
+    both = [*runs, *(on_task(run, "other", 5.0) for run in runs)]
+    with pytest.raises(ConfigError, match=r"task.environment differs: .* or name for each of them the fitness that"):
+        compare.grouped(both)
+    bounds = {"point_maze": (-80.0, -60.0), "other": (-795.0, -595.0)}
+    shares = compare.normalised(both, bounds)
+    groups = compare.grouped(shares)
+    assert [(group.name, [*group.tasks], len(group.runs)) for group in groups] == [
+        ("es", ["other", "point_maze"], 8), ("me_es", ["other", "point_maze"], 8)
+    ]  # fmt: skip
+    by_name = {measure.name: measure for measure in between.compared(groups, paired=False)}
+    assert set(by_name) == {"best_fitness", "coverage"}
+    es, me_es = by_name["best_fitness"].averages
+    assert (es.median, me_es.median) == (pytest.approx(0.925), pytest.approx(0.425))
+    [pair] = by_name["best_fitness"].pairs
+    assert pair.difference.p == pytest.approx(2 / 70**2)  # shared out within each task
+    assert (pair.difference.improvement, pair.difference.shift) == (1.0, pytest.approx(0.5))
+    summary = compare.summaries(groups, None)[0]
+    assert summary.intervals["best_fitness"] == es.median_interval
+    said = words(comparison_page(shares, threshold=0.9))
+    assert "16 runs on other, point_maze" in said
+    assert "other (-795.0, -595.0), point_maze (-80.0, -60.0)" in said
+    with pytest.raises(ConfigError, match="me_es has no run of other"):
+        compare.grouped(shares[:12])
+    with pytest.raises(ConfigError, match="bounds: other has none"):
+        compare.normalised(both, {"point_maze": (0.0, 1.0)})
+    with pytest.raises(ConfigError, match="write TASK=LOW,HIGH"):
+        bounds_of(["point_maze=1"])
+    assert bounds_of(["brax:ant=-1,2e3"]) == {"brax:ant": (-1.0, 2000.0)}
+
+
+def test_groups_are_shown_under_other_names(runs):
+    named = compare.labelled(runs, (), {"es": "evolution strategy"})
+    assert [group.name for group in compare.grouped(named, compare.GROUP)] == ["evolution strategy", "me_es"]
+    with pytest.raises(ConfigError, match="there is no group ess; did you mean es"):
+        compare.labelled(runs, (), {"ess": "x"})
 
 
 def test_files_of_statistics(runs, tmp_path):
