@@ -18,6 +18,7 @@ from es_service.loop.correction import Correction
 from es_service.loop.evaluated import evaluated_table
 from es_service.loop.generation import better, fittest, results_in
 from es_service.loop.history import (
+    METRIC,
     HistoryRow,
     Table,
     evaluation_columns,
@@ -164,6 +165,7 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
         **population_columns(finished.members.results, infeasible),
         **({"infeasible_members": infeasible} if search.config.search.allow_infeasible else {}),
         **evaluation_columns(table, results_in(told), at, search.task),
+        **{f"{METRIC}{name}": or_none(float(of(state.search))) for name, of in search.algorithm.metrics.items()},
         "wall_clock_s": state.wall_clock_s,
         "rollout_s": or_none(state.rollout_s),
         "cpu_s": or_none(state.cpu_s),

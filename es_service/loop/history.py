@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -84,6 +84,8 @@ _CORRECTED = (
 )
 CORRECTED = tuple(column.name for column in _CORRECTED)
 """Names of these columns, which a run has if `map.correct_every` is set."""
+METRIC = "metric_"
+"""Beginning of the columns of a search's own metrics."""
 _INFEASIBLE = Column("infeasible_members", "INTEGER", True, "members with a fitness of -inf, which are no invalid ones")
 _EPISODES = (
     Column("fitness_first", "REAL", False, "fitness of its first evaluation episode, which a replay shows"),
@@ -126,13 +128,18 @@ LATER = frozenset(column.name for column in _COSTS)
 
 
 def history_columns(
-    task: TaskSpec, has_map: bool, corrects: bool = False, allows_infeasible: bool = False
+    task: TaskSpec,
+    has_map: bool,
+    corrects: bool = False,
+    allows_infeasible: bool = False,
+    metrics: Iterable[str] = (),
 ) -> tuple[Column, ...]:
     """All columns of a run, with those of its descriptor's dimensions, of its goal and of its map, if it has these.
 
     Args:
         corrects: whether `map.correct_every` is set.
         allows_infeasible: whether `search.allow_infeasible` is set.
+        metrics: names of the metrics of the search.
     """
     descriptor = tuple(
         column
@@ -145,7 +152,8 @@ def history_columns(
     goal, of_map = _GOAL if task.has_goal else (), _MAP if has_map else ()
     corrected = _CORRECTED if has_map and corrects else ()
     infeasible = (_INFEASIBLE,) if allows_infeasible else ()
-    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES, *_COSTS)
+    of_search = [Column(f"{METRIC}{name}", "REAL", True, f"metric of the search: {name}") for name in metrics]
+    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES, *_COSTS, *of_search)
 
 
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.history import CORRECTED
+from es_service.loop.history import CORRECTED, METRIC
 from es_service.report.series import Columns
 from es_service.runs.certified import measure_of
 
@@ -80,13 +80,16 @@ def measure_named(column: str) -> Measure:
     if column.startswith(ELSEWHERE):
         note = "Mean fitness of the policy in this other task, in episodes that no selection has seen."
         return Measure(column[:1].upper() + column[1:], column, note)
+    if column.startswith(METRIC):
+        name = column.removeprefix(METRIC)
+        return Measure(name, name, "Metric of the search.")
     return MEASURES.get(column) or Measure(column, column, "")
 
 
 def measures(runs: Sequence[RunData]) -> dict[str, Measure]:
     """Column -> what is said of it, for all columns that all runs have a value of."""
-    first = [column for column in runs[0].history if column.startswith(ELSEWHERE)]
-    names = [CERTIFIED, SUCCESS, *first, *(name for name in MEASURES if name not in (CERTIFIED, SUCCESS))]
+    elsewhere, own = ([column for column in runs[0].history if column.startswith(one)] for one in (ELSEWHERE, METRIC))
+    names = [CERTIFIED, SUCCESS, *elsewhere, *(name for name in MEASURES if name not in (CERTIFIED, SUCCESS)), *own]
     return {name: measure_named(name) for name in names if all(has_values(run, name) for run in runs)}
 
 

@@ -17,7 +17,7 @@ PANELS_IN_A_ROW = 6
 PANEL_SIZE = 1.7
 """Width of a panel in inches; its title is above it."""
 CURVES_HEIGHT = 2.4
-DOT_AREA = 0.8
+DOT_AREA = 2.5
 """In square points."""
 FEWEST_COLUMNS = 4
 """So many panels wide is the figure at least, or the curves were too narrow."""

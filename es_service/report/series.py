@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.history import evaluated_word
+from es_service.loop.history import METRIC, evaluated_word
 from es_service.runs.objectives import objectives, weights
 
 Columns = Mapping[str, NDArray[np.float64]]
@@ -148,7 +148,12 @@ def charts(history: Columns, centres: Columns, qd_offset: float) -> list[Chart]:
     newest = {name: values_G[-1] for name, values_G in history.items() if values_G.size}
     word = evaluated_word(newest) if newest else "centre"
     chart_list = []
-    for spec in _SPECS:
+    own = [
+        _Spec(name.removeprefix(METRIC), "Metric of the search.", ((name.removeprefix(METRIC), name, "mean"),))
+        for name in history
+        if name.startswith(METRIC)
+    ]
+    for spec in (*_SPECS, *own):
         lines = tuple(
             Line(label.format(evaluated=word), thinned(history[column], ends_K, group))
             for label, column, group in spec.lines

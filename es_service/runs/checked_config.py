@@ -6,6 +6,7 @@ A config that its search refuses fails here, before a folder is created or a wor
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -129,7 +130,15 @@ def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, An
 def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
     """The columns of a run's history, and those of its evaluated centres."""
     has_map, corrects = config.map.enabled, config.map.correct_every is not None
-    history = history_columns(task, has_map, corrects, config.search.allow_infeasible)
+    metrics = sorted(ALGORITHMS[config.search.algorithm](config).metrics)
+    if wrong := [name for name in metrics if re.fullmatch(r"[a-z][a-z0-9_]{0,39}", name) is None]:
+        raise ConfigError(
+            f"search.algorithm: {config.search.algorithm} has a metric {wrong[0]!r}; its name must be of up to 40 "
+            "small letters, digits and _, a letter first",
+            field="search.algorithm",
+            value=wrong[0],
+        )
+    history = history_columns(task, has_map, corrects, config.search.allow_infeasible, metrics)
     return history, evaluated_columns(task, has_map)
 
 

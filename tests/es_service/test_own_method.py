@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from es_service import api, write_report
+from es_service import api, write_comparison, write_report
 from es_service.cli.printing import text_console
 from es_service.cli.status import print_status, print_summary
 from es_service.errors import ConfigError
@@ -46,7 +46,8 @@ def restless(config):
     def restart(state, index, cell, elite):
         return replace(from_elite(state, index, cell, elite), extra={"restarts": state.extra["restarts"] + 1})
 
-    return replace(shared, start_cells=start_cells, restart=restart, extra={"restarts": np.zeros(1, np.int64)})
+    return replace(shared, start_cells=start_cells, restart=restart, extra={"restarts": np.zeros(1, np.int64)},
+                   metrics={"restarts": lambda state: float(state.extra["restarts"][0])})
 '''
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 30},
@@ -81,9 +82,16 @@ def test_its_declarations_are_those_of_the_service(tmp_path):
     ]
 
 
+def test_a_metric_has_the_name_of_a_column(tmp_path):
+    (tmp_path / "restless_method.py").write_text(METHOD.replace('{"restarts": lambda', '{"Re starts": lambda'))
+    with pytest.raises(ConfigError, match="has a metric 'Re starts'; its name must be"):
+        api.run(api.load_config(CONFIG), tmp_path / "run")
+
+
 def test_its_runs_are_resumed_forked_verified_reported_and_exported(tmp_path, capsys):
     whole = api.run(api.load_config(CONFIG), tmp_path / "whole").run
     assert (restarts(whole), whole.constants["search.patience"]) == (2, 3)
+    assert whole.history.metric_restarts.tolist() == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
     part = api.run(api.load_config(CONFIG, ["budget.generations=4"]), tmp_path / "part").run
     fork = api.fork(part.folder, ["search.patience=2", "budget.generations=8"], out=tmp_path / "fork").run
     resumed = api.resume(part.folder, ["budget.generations=8"]).run
@@ -91,7 +99,11 @@ def test_its_runs_are_resumed_forked_verified_reported_and_exported(tmp_path, ca
     assert fork.digest() != resumed.digest() == whole.digest()
     assert not any(checked.differences for checked in verify(whole))
     write_report(whole.folder, tmp_path / "report.html")
-    assert "search.patience" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "search.patience" in page
+    assert "Metric of the search." in page
+    write_comparison([whole.folder, fork.folder], tmp_path / "both.html", statistics=tmp_path / "both.json")
+    assert "metric_restarts" in (tmp_path / "both.json").read_text()
     assert {file.name for file in export(whole, "npz", tmp_path / "export")} >= {"policies.npz"}
     print_status(text_console(), whole)
     print_summary(text_console(), whole, "the budget is spent")

@@ -257,5 +257,7 @@ class Algorithm:
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
     extra: Mapping[str, Any] = field(default_factory=dict)
     """What else the search remembers, by name, at first: arrays, and mappings of such (`search.arrays`)."""
+    metrics: Mapping[str, Callable[[SearchState], float]] = field(default_factory=dict)
+    """Numbers that the history records, by name: state after a generation -> its value; NaN for none."""
     counts_samples: bool = False
     """Whether the entries of the map count the episodes of which their values are the mean."""
