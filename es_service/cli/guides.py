@@ -18,6 +18,7 @@ CLONE = PACKAGE.parent
 GUIDES = {
     "using": (PACKAGE / "guides" / "using.md",),
     "configs": (CLONE / "configs" / "README.md", PACKAGE / "shipped_configs" / "README.md"),
+    "qdax": tuple(folder / "qdax_and_pyribs.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs")),
     "workers": (CLONE / "workers" / "README.md",),
     "docker": (CLONE / "docker" / "README.md", PACKAGE / "launch_files" / "README.md"),
     "es_service": (PACKAGE / "README.md",),

@@ -28,6 +28,7 @@ BUDGET_S = {
     "README.md": 400,
     USING: 600,
     "configs/README.md": 200,
+    "configs/qdax_and_pyribs.md": 100,
     "docker/README.md": 10,
     "es_service/README.md": 100,
     "workers/README.md": 400,
