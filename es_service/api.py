@@ -42,7 +42,7 @@ view.draw_for_notebook = _draw_for_notebook
 
 
 def _ignore(sentence: str) -> None:
-    """Do nothing; the default for `on_compile`."""
+    """Do nothing; the default for `on_compile` and `on_output`."""
 
 
 def _listener(
@@ -50,6 +50,7 @@ def _listener(
     on_notice: OnNotice,
     on_compile: OnNotice,
     progress: bool,
+    on_output: OnNotice,
     hook: Callable[[str], None] = no_hook,
 ) -> Listener:
     """What a session calls: with each history row `on_generation`, or if there is none, what shows the progress in a
@@ -65,7 +66,7 @@ def _listener(
         else:
             yield lambda row: None
 
-    return Listener(shown, on_notice, on_compile, hook)
+    return Listener(shown, on_notice, on_compile, on_output, hook)
 
 
 def run(
@@ -76,6 +77,7 @@ def run(
     on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
+    on_output: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
@@ -91,6 +93,8 @@ def run(
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.
         on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
+        on_output: called with the lines that workers print, their simulators included, such as "worker 3: a limit was
+            reached"; of what is printed fast, only with the newest.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 
     Raises:
@@ -100,7 +104,7 @@ def run(
     named = os.fspath(config) if isinstance(config, str | os.PathLike) else None
     if not isinstance(config, RunConfig):
         config = load_config(config)
-    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    listener = _listener(on_generation, on_notice, on_compile, progress, on_output, hook)
     return outcome_of(_begin(config, out, named, listener))
 
 
@@ -124,6 +128,7 @@ def resume(
     on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
+    on_output: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Continue a run from its last committed generation; its result has the same bits as without an interruption.
@@ -145,7 +150,7 @@ def resume(
         return changed_config(source, overrides, given=store.meta.given)
 
     overrides, asked = _with_values(overrides)
-    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    listener = _listener(on_generation, on_notice, on_compile, progress, on_output, hook)
     return outcome_of(continue_run(given_path(folder), changed, listener, asked, strict=strict))
 
 
@@ -157,13 +162,16 @@ def run_or_resume(
     on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
+    on_output: OnNotice = _ignore,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
 
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
-    return outcome_of(begin_or_resume(config, out, _listener(on_generation, on_notice, on_compile, progress)))
+    return outcome_of(
+        begin_or_resume(config, out, _listener(on_generation, on_notice, on_compile, progress, on_output))
+    )
 
 
 def begin_or_resume(config: RunConfig | Source, out: str | os.PathLike[str], listener: Listener) -> Session[Outcome]:
@@ -184,6 +192,7 @@ def fork(
     on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
+    on_output: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a new run from another run's state, with changed settings.
@@ -206,7 +215,7 @@ def fork(
     again = WayOut("fork", "", os.fspath(parent), asked, generation=generation, out=_text(out))
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    listener = _listener(on_generation, on_notice, on_compile, progress, on_output, hook)
     outcome = outcome_of(create_run(config, _folder(out, config), lineage, beginning, again, listener))
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(

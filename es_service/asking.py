@@ -291,7 +291,11 @@ def ask_tell(
         )
     task = task_of(wanted)
     listener = Listener(
-        lambda folder: nullcontext(lambda row: None), on_notice, lambda sentence: None, asks_caller=True
+        lambda folder: nullcontext(lambda row: None),
+        on_notice,
+        lambda sentence: None,
+        lambda line: None,
+        asks_caller=True,
     )
     session = begin_or_resume(wanted, folder, listener)
     search = AskTell(folder, worker_spec(wanted, task, asks_caller=True), len(task.descriptor_names), session)

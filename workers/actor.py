@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.machine import platform_info, platform_text
-from es_service.protocol.messages import Work, WorkerPlace
+from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.newest_output import newest_output
 from es_service.protocol.process_environment import DEPTH, worker_environment
 from es_service.protocol.raised import sendable
@@ -25,6 +25,7 @@ from workers.xla_cache import xla_cache_settings
 if TYPE_CHECKING:  # they import JAX, whose settings are made here
     from workers.compilable import Compilable
     from workers.parents import Parents
+    from workers.reports import Reports
 
 
 class WorkerActor:
@@ -44,6 +45,7 @@ class WorkerActor:
         self._task_code: tuple[str, ...] = ()
         self._run_chunks: Compilable | None = None
         self._parents: Parents | None = None
+        self._reports: Reports | None = None
         self._turn = Lock()
         """Held while it compiles, and while it keeps the parents of policies that came with a call."""
 
@@ -54,11 +56,13 @@ class WorkerActor:
         """Host, process and node of this worker. The engine calls this first; it returns once the actor is placed."""
         import ray
 
-        return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id())
+        logs = [os.readlink(file) for file in ("/proc/self/fd/1", "/proc/self/fd/2") if os.path.exists(file)]
+        return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id(), tuple(logs))
 
-    def progress(self) -> progress.Seen:
-        """How far it is with the oldest of its calls; answered while they run, so that the engine can ask it."""
-        return progress.seen()
+    def progress(self) -> tuple[progress.Seen, Report | None]:
+        """How far it is with the oldest of its calls, and its report; answered while they run, so that the engine can
+        ask it."""
+        return progress.seen(), self._reports and self._reports.report()
 
     def build(self) -> str:
         """Import JAX with the settings of all workers and build the run's functions; returns the platform's text.
@@ -79,12 +83,15 @@ class WorkerActor:
         os.environ.update({DEPTH: "1"} | environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
         from workers.parents import Parents
+        from workers.reports import Reports, require_room
         from workers.rollouts import BACKENDS, platform_of_gpu
 
         self._task_code = spec.task_code
         self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(*self._task_code):
+            self._reports = Reports(spec, self._cores)
             self._run_chunks = make_worker_with_cores(spec, self._cores)
+            require_room(spec, self._cores)
         return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
     def compile(self, chunks: bytes, *parts: bytes) -> float:
@@ -97,7 +104,7 @@ class WorkerActor:
             return self._run_chunks.seconds_to_compile(self._unpacked(chunks, parts))
 
     def run(self, chunks: bytes, *parts: bytes) -> bytes:
-        """Run chunks; returns the pickled results, or None if it lacks parents of policies.
+        """Run chunks; returns the pickled (results, its report or None), or None if it lacks parents of policies.
 
         Args:
             chunks: pickled ([subject], [(index of its subject among these and then `parts`, Chunk)]); with them travel
@@ -105,13 +112,15 @@ class WorkerActor:
             parts: other subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
         """
         assert self._run_chunks is not None, "run was called before build"
+        assert self._reports is not None, "build makes them, too"
         with sendable(*self._task_code):
             try:
                 with self._turn:
                     work = self._unpacked(chunks, parts)
             except LackingError:
                 return pickle.dumps(None)
-            return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)
+            self._reports.note(results := self._run_chunks(work))
+            return pickle.dumps((results, self._reports.report()), pickle.HIGHEST_PROTOCOL)
 
     def _unpacked(self, chunks: bytes, parts: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""

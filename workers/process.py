@@ -29,6 +29,7 @@ from es_service.protocol.wire import framed, receive
 from workers import progress
 from workers.parents import Parents
 from workers.progress import Seen
+from workers.reports import Reports, require_room
 from workers.rollouts import BACKENDS, platform_of_gpu
 from workers.xla_cache import xla_cache_settings
 
@@ -53,7 +54,8 @@ def main(descriptor: int) -> None:
     [ChunkResult]), ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies,
     ("lacks", item, attempt). Before it computes the first work item of a kind, it compiles for it and sends
     ("compiled", kind, seconds). While it takes long for something, its start included, it sends ("progress", doing,
-    done, total) as in `progress.Seen` when it has done more of it.
+    done, total) as in `progress.Seen` when it has done more of it; and ("report", Report) when there is anything to
+    report.
     """
     os.set_inheritable(descriptor, False)
     with socket.socket(fileno=descriptor) as control:
@@ -80,12 +82,14 @@ class Made(NamedTuple):
 def _accept(control: socket.socket, runs: SimpleQueue[tuple[Future[Made | RaisedError], WorkerSpec]]) -> None:
     """Serve a worker for each socket that comes, until the parent closes its end; this ends the process."""
     try:
-        run = None
+        run = reports = None
         while (given := _next(control)) is not None:
             if not isinstance(given, int):
                 runs.put(run := (Future(), given))
+                # One for all threads, which print and leak together; what was computed before has leaked, too.
+                reports = Reports(given, episodes=0 if reports is None else reports.episodes)
             elif run is not None:
-                threading.Thread(target=_work, args=(given, *run), daemon=True).start()
+                threading.Thread(target=_work, args=(given, *run, reports), daemon=True).start()
     except Exception:
         traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
@@ -126,25 +130,27 @@ def _made(spec: WorkerSpec, before: dict[str, tuple[ChunkFunctions, set[str]]]) 
         before[repr(of_any_seed)] = known  # the newest is last
         for old in list(before)[:-MOST_KNOWN]:
             del before[old]
-        return Made(make_worker(spec, known[0]), known[1])
+        made = Made(make_worker(spec, known[0]), known[1])
+        require_room(spec)
+        return made
     except BaseException as error:  # also sys.exit in an environment
         return raised(error, *spec.task_code)
 
 
-def _work(descriptor: int, made: Future[Made | RaisedError], spec: WorkerSpec) -> None:
+def _work(descriptor: int, made: Future[Made | RaisedError], spec: WorkerSpec, reports: Reports) -> None:
     """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
-            _serve(parent, made, spec)
+            _serve(parent, made, spec, reports)
         except (EOFError, ConnectionError):
             pass
         except Exception:
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: WorkerSpec) -> None:
+def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: WorkerSpec, reports: Reports) -> None:
     """Receive chunks and send their results; does not return unless the worker is broken."""
-    with closing(_Said(parent)) as said:
+    with closing(_Said(parent, reports)) as said:
         with said.progress():
             ready = made.result()
         if isinstance(ready, RaisedError):
@@ -172,26 +178,34 @@ def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: Worker
                                 compiled.add(kind)
                                 ready.compiled.add(kind)
                                 said.say("compiled", kind, seconds)
-                            answer = ("results", item, attempt, ready.run_chunks(work))
+                            answer = ("results", item, attempt, results := ready.run_chunks(work))
+                            reports.note(results)
                     except LackingError:
                         answer = ("lacks", item, attempt)
                     except BaseException as error:  # also sys.exit in an environment
                         answer = ("failure", item, attempt, raised(error, *spec.task_code))
                     said.say(*answer)
+                    said.report()
                     forget_old_subjects(subjects)
 
 
 class _Said:
     """What a worker says to its parent: answers, and from a thread of its own how far it is with what takes long."""
 
-    def __init__(self, parent: socket.socket) -> None:
-        self._parent, self._turn, self._now, self._closed = parent, threading.Lock(), 0, threading.Event()
+    def __init__(self, parent: socket.socket, reports: Reports) -> None:
+        self._parent, self._reports, self._now = parent, reports, 0
+        self._turn, self._closed = threading.Lock(), threading.Event()
         threading.Thread(target=self._report, daemon=True, name="reports progress").start()
 
     def say(self, *message: Any) -> None:
         """Send a message."""
         with self._turn:
             self._parent.sendall(framed(message))
+
+    def report(self) -> None:
+        """Send what there is to report."""
+        if (report := self._reports.report()) is not None:
+            self.say("report", report)
 
     @contextmanager
     def progress(self) -> Iterator[None]:
@@ -213,6 +227,7 @@ class _Said:
         before: tuple[int, Seen] | None = None
         with suppress(OSError):  # the parent has closed its end
             while not self._closed.wait(REPORT_S):
+                self.report()
                 with self._turn:
                     now = self._now, progress.seen()
                     if self._now % 2 and before is not None and before[0] == now[0] and before[1] != now[1]:

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from es_service.cli.options import ConfigArgument, SetOption, overrides
-from es_service.cli.printing import print_json
+from es_service.cli.options import ConfigArgument, LinesOption, SetOption, overrides
+from es_service.cli.printing import print_json_line
 from es_service.config.given import Overrides, parse_overrides
 from es_service.config.parts import TASK_OPTIONS
 from es_service.config.resolution import options_of
@@ -163,7 +163,7 @@ def rollouts(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="task.options.KEY=VALUE", help="Change an option of the tasks.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
+    as_json: LinesOption = False,
 ) -> None:
     """Measure environment steps per second: with and without a policy, on one core and on all."""
     policies = {None: (False, True), "on": (True,), "off": (False,)}.get(policy)
@@ -180,7 +180,8 @@ def rollouts(
         task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds, overrides=set_ or ()
     )
     if as_json:
-        print_json(list(rows))
+        for row in rows:
+            print_json_line(row)
         return
     print(HEADER)
     for row in rows:
@@ -199,7 +200,7 @@ def scaling(
     ] = SCALING_WORKERS,
     cores_per_node: Annotated[int, typer.Option("--cores-per-node", min=1, help="Cores of each node.")] = 64,
     set_: SetOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
+    as_json: LinesOption = False,
 ) -> None:
     """Predict how fast a config runs on a cluster, from measurements on this machine. It takes half a minute."""
     from es_service.runs.checked_config import load_config
@@ -210,7 +211,8 @@ def scaling(
         raise ConfigError(f"--workers {workers}: must be whole numbers, each at least 1, such as {SCALING_WORKERS}")
     rows = bench_scaling(load_config(config, overrides(set_)), [int(count) for count in counts], cores_per_node)
     if as_json:
-        print_json(list(rows))
+        for row in rows:
+            print_json_line(row)
         return
     print(SCALING_HEADER)
     for row in rows:

@@ -11,8 +11,16 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
-from es_service.cli.options import ConfigArgument, JsonOption, SeedOption, SetOption, WorkersOption, overrides
-from es_service.cli.printing import command, print_json, print_note
+from es_service.cli.options import (
+    ConfigArgument,
+    JsonOption,
+    LinesOption,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+    overrides,
+)
+from es_service.cli.printing import command, print_json, print_json_line, print_note
 from es_service.cli.sweep import GridOption, ParallelOption, SeedsOption, grid_of, seeds_of
 from es_service.config.given import parse_overrides, read_config
 from es_service.errors import ConfigError
@@ -43,6 +51,7 @@ def submit(
     grid: GridOption = None,
     seeds: SeedsOption = None,
     parallel: ParallelOption = None,
+    as_json: LinesOption = False,
 ) -> None:
     """Submit a run to a Ray cluster as a job; with --grid or --seeds, a sweep. The same command again continues it,
     whatever interrupted it.
@@ -59,6 +68,9 @@ def submit(
         # The cluster's head node checks its paths.
         package = run_package(api.load_config(config, wanted, new=False), out)
     job = jobs.submit(package, address)
+    if as_json:
+        print_json_line({"job": job, "folder": out, "sent": list(package.files), "expected": list(package.expected)})
+        return
     print(job, flush=True)
     if package.files:
         print_note(f"sent with it: {', '.join(package.files)}")

@@ -30,6 +30,7 @@ from es_service.cli.options import (
     ConfigArgument,
     EngineOption,
     JsonOption,
+    LinesOption,
     LogLevelOption,
     LogOption,
     OrResumeOption,
@@ -37,6 +38,7 @@ from es_service.cli.options import (
     RunArgument,
     SeedOption,
     SetOption,
+    ShowOutputOption,
     StrictOption,
     WorkersOption,
     overrides,
@@ -88,23 +90,26 @@ def run(
     log: LogOption = None,
     log_level: LogLevelOption = None,
     or_resume: OrResumeOption = False,
+    show_output: ShowOutputOption = False,
+    as_json: LinesOption = False,
 ) -> None:
     """Start a run from a config file; with --seeds, a run for each seed."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
     if seeds is not None:
-        run_seeds(config, seeds, out, wanted, seed, log, log_level)
+        run_seeds(config, seeds, out, wanted, seed, log, log_level, as_json=as_json)
         return
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
     print_config_notes(config, [loaded])
-    if loaded.compute.engine == "ray":  # on the cores of one machine it says nothing that helps
+    if loaded.compute.engine == "ray" and not as_json:  # on the cores of one machine it says nothing that helps
         with contextlib.suppress(SystemExit):  # rich's answer to a closed output
             print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
+    shown = {"show_output": show_output, "as_json": as_json}
     with _naming(config, wanted):
-        session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
+        session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log, **shown)
 
 
 @app.command()
@@ -117,10 +122,12 @@ def resume(
     strict: StrictOption = False,
     log: LogOption = None,
     log_level: LogLevelOption = None,
+    show_output: ShowOutputOption = False,
+    as_json: LinesOption = False,
 ) -> None:
     """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    session(folder, partial(api.resume, folder, wanted, strict=strict), log)
+    session(folder, partial(api.resume, folder, wanted, strict=strict), log, show_output=show_output, as_json=as_json)
 
 
 @app.command()
@@ -137,11 +144,14 @@ def fork(
     address: AddressOption = None,
     log: LogOption = None,
     log_level: LogLevelOption = None,
+    show_output: ShowOutputOption = False,
+    as_json: LinesOption = False,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
-    session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder), log)
+    fork = partial(api.fork, parent, wanted, generation=generation, out=folder)
+    session(folder, fork, log, show_output=show_output, as_json=as_json)
 
 
 app.command()(status)

@@ -41,11 +41,15 @@ StrictOption = Annotated[
     bool, typer.Option("--strict", help="Refuse to continue with other code, packages or kind of processor.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+LinesOption = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each row, instead of text.")]
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
 ]
 
 
+ShowOutputOption = Annotated[
+    bool, typer.Option("--show-output", help="Print what workers print, simulators included, on stderr.")
+]
 LogOption = Annotated[
     list[str] | None,
     typer.Option(

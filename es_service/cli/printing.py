@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shlex
 import shutil
 import sys
@@ -145,6 +146,16 @@ def print_config_notes(source: Source, configs: Sequence[RunConfig]) -> None:
 
 def print_json(value: object) -> None:
     print(json.dumps(_finite(value), indent=1, allow_nan=False))
+
+
+def print_json_line(value: object) -> None:
+    """Print a value as one line of JSON on stdout, where whoever reads it gets it at once. If stdout is closed,
+    SystemExit is raised, as rich does it, and later lines go nowhere."""
+    try:
+        print(json.dumps(_finite(value), allow_nan=False), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would say so again at its end
+        raise SystemExit(1) from None
 
 
 def _finite(value: Any) -> Any:

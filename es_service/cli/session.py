@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,12 +23,12 @@ from es_service.cli.options import (
     WorkersOption,
     overrides,
 )
-from es_service.cli.printing import command, console, errors, print_line, print_note
+from es_service.cli.printing import command, console, errors, print_json_line, print_line, print_note
 from es_service.cli.status import print_certified, print_summary
 from es_service.errors import Interrupted, ServiceError, WayOut
 from es_service.loop.history import Row
 from es_service.protocol.raised import users_error
-from es_service.report.progress import print_notice, show_progress
+from es_service.report.progress import ShowNotice, ShowRow, print_notice, show_progress
 from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
@@ -41,9 +41,21 @@ def told_to_user(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceEr
     return ServiceError(text, ways_out=ways_out) if text else None
 
 
-def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
+def session(
+    folder: Path,
+    work: Callable[..., api.Outcome],
+    log: Sequence[str] | None,
+    *,
+    show_output: bool = False,
+    as_json: bool = False,
+) -> None:
     """Show the progress of a run, send it to trackers, and show a summary at its end. The run continues if the output
-    is closed."""
+    is closed.
+
+    Args:
+        show_output: whether to print what workers print, too.
+        as_json: whether to print each row of the history as a line of JSON, and at the end a line that says why.
+    """
     began = False
 
     def tell(show: Callable[[Any], None], what: Row | str) -> None:
@@ -60,13 +72,14 @@ def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] |
 
     try:
         with (
-            show_progress(console, errors, str(folder)) as (show, note),
+            _json_lines() if as_json else show_progress(console, errors, str(folder)) as (show, note),
             tracked(folder, log or (), partial(tell, note)) as send,
         ):
             outcome = work(
                 on_generation=partial(tell_generation, show),
                 on_notice=partial(tell, note),
                 on_compile=partial(tell, note),
+                on_output=partial(tell, print_note) if show_output else lambda line: None,
             )
     except Interrupted:
         if began or holds_run(folder):
@@ -81,7 +94,16 @@ def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] |
         raise told from error
     with contextlib.suppress(SystemExit):
         reason = outcome.reason if began else f"no generation was run, since {outcome.reason}"
-        print_summary(console, outcome.run, reason)
+        if as_json:
+            print_json_line({"run": str(outcome.run.folder), "is_finished": outcome.is_finished, "reason": reason})
+        else:
+            print_summary(console, outcome.run, reason)
+
+
+@contextlib.contextmanager
+def _json_lines() -> Iterator[tuple[ShowRow, ShowNotice]]:
+    """As `show_progress`, for rows as lines of JSON."""
+    yield print_json_line, partial(print_notice, errors)
 
 
 def polish(

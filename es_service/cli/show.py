@@ -54,6 +54,7 @@ def status_data(status: RunStatus) -> dict[str, Any]:
         "state": state(status),
         "driver": status.driver,
         "last_end": status.end,
+        "output": status.output,
         "limits": status.limits,
         "target_certified": status.target_certified,
         "tries": status.tries,

@@ -59,6 +59,10 @@ def print_status(console: Console, run: Run) -> None:
         state(status) if status.driver else f"{state(status)}; continue with: {way_command(how_to_continue(status))}"
     )
     _print_fields(console, fields | _progress(status) | _parameters(status) | _certified(run))
+    if status.output:
+        print_line(console, "newest lines that its workers have printed:")
+        for line in status.output:
+            print_line(console, f"  {line}")
 
 
 def follow_status(console: Console, run: Run) -> None:

@@ -25,12 +25,21 @@ from es_service import api
 from es_service.cli.options import (
     AddressOption,
     EngineOption,
+    LinesOption,
     LogLevelOption,
     LogOption,
     SetOption,
     overrides,
 )
-from es_service.cli.printing import console, errors, print_config_notes, print_error, print_line, print_note
+from es_service.cli.printing import (
+    console,
+    errors,
+    print_config_notes,
+    print_error,
+    print_json_line,
+    print_line,
+    print_note,
+)
 from es_service.config.given import parse_overrides
 from es_service.config.text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem, counted
@@ -91,14 +100,15 @@ def sweep(
     address: AddressOption = None,
     log: LogOption = None,
     log_level: LogLevelOption = None,
+    as_json: LinesOption = False,
 ) -> None:
     """Run configs with several settings and seeds, and compare the runs. The same command again continues it."""
     if not grid and seeds is None and len(configs) < 2:
         raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both, or several configs")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     certifying = Certifying(steps_of(certify_at or "")) if certify or certify_at else None
-    options = _options_of_each(log, log_level)
-    run_sweep(labelled(configs, label or ()), out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying)
+    options, named = _options_of_each(log, log_level), labelled(configs, label or ())
+    run_sweep(named, out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying, as_json=as_json)
 
 
 def run_seeds(
@@ -109,12 +119,15 @@ def run_seeds(
     seed: int | None,
     log: list[str] | None,
     log_level: str | None,
+    *,
+    as_json: bool,
 ) -> None:
     """`run --seeds`: a sweep without a grid."""
     if seed is not None:
         raise ConfigError("--seed and --seeds cannot be combined; give one of them")
     folder = out if out is not None else api.default_folder(api.load_config(config, wanted), "seeds")
-    run_sweep(labelled([config], ()), folder, wanted, {}, seeds, None, _options_of_each(log, log_level))
+    options = _options_of_each(log, log_level)
+    run_sweep(labelled([config], ()), folder, wanted, {}, seeds, None, options, as_json=as_json)
 
 
 def _options_of_each(trackers: list[str] | None, log_level: str | None) -> list[str]:
@@ -145,15 +158,21 @@ def run_sweep(
     parallel: int | None,
     options: Sequence[str],
     certifying: Certifying | None = None,
+    *,
+    as_json: bool,
 ) -> None:
-    """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
+    """Run a sweep to its end and write the comparison; exit with code 1 if a run failed.
+
+    Args:
+        as_json: whether to print a line of JSON for each run that has changed, and one for the comparison.
+    """
     planned = plan(configs, out, grid, None if seeds is None else seeds_of(seeds), wanted)
     for config in configs:
         print_config_notes(config.source, [run.config for run in planned if run.source == config.source])
     for note in left_out_notes(planned):
         print_note(f"note: {note}")
     try:
-        with show_sweep(console, errors, str(out)) as (show, note):
+        with json_lines(errors) if as_json else show_sweep(console, errors, str(out)) as (show, note):
             runs = run_planned(planned, out, parallel, show, note, options, certifying)
     except Interrupted:
         print_note(
@@ -161,7 +180,7 @@ def run_sweep(
             f"--out {shlex.quote(str(out))}, continues"
         )
         raise
-    _compare(runs, out)
+    _compare(runs, out, (lambda file: print_json_line({"report": str(file)})) if as_json else print)
     for run in runs:
         if run.state == "stopped":
             print_note(f"{run.name} is not finished: {run.reason}. Raise budget.wall_clock_s")
@@ -173,7 +192,7 @@ def run_sweep(
         raise typer.Exit(1)
 
 
-def _compare(runs: Sequence[SweptRun], out: Path) -> None:
+def _compare(runs: Sequence[SweptRun], out: Path, shows: Callable[[Path], object]) -> None:
     """Write the page that compares the runs with a finished generation; a note if they cannot be compared."""
     from es_service.report.write import REPORT, write_comparison
 
@@ -182,7 +201,7 @@ def _compare(runs: Sequence[SweptRun], out: Path) -> None:
         return
     try:
         for file in write_comparison(folders, out / REPORT):
-            print(file)
+            shows(file)
     except ConfigError as error:
         print_note(f"note: there is no comparison, since {error.sentence}")
 
@@ -270,6 +289,29 @@ def show_sweep(console: Console, errors: Console, title: str) -> Iterator[tuple[
                 live.update(live_table(title, runs, console.width, console.height))
 
         yield show, partial(print_notice, live.console)
+
+
+@contextmanager
+def json_lines(errors: Console) -> Iterator[tuple[OnProgress, ShowNotice]]:
+    """As `show_sweep`, with a line of JSON for each run that has changed."""
+    before: dict[str, SweptRun] = {}
+
+    def show(runs: Sequence[SweptRun]) -> None:
+        with suppress(SystemExit):  # a closed output; the runs continue
+            for run in runs:
+                if run != before.get(run.name):
+                    before[run.name] = run
+                    print_json_line(
+                        {
+                            "run": run.name,
+                            "folder": str(run.folder),
+                            "state": run.state,
+                            "reason": run.reason,
+                            "newest": run.row,
+                        }
+                    )
+
+    yield show, partial(print_notice, errors)
 
 
 def live_table(title: str, runs: Sequence[SweptRun], width: int, height: int) -> Group:

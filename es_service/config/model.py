@@ -69,6 +69,11 @@ class TaskConfig(Section):
         description="For tasks of Python objects: whether each episode has a new object, for simulators that carry "
         "something over from one episode to the next. `es-service doctor TASK` finds whether they do.",
     )
+    recycle_after_episodes: Count | None = Field(
+        None,
+        description="For tasks of Python objects and functions: each worker is replaced by a new process after this "
+        "many episodes, for simulators that leak. null: never. It changes no result, and may change on resume.",
+    )
     time_limit_s: Positive | None = Field(
         None,
         description="Longest time in seconds of a chunk of episodes, for tasks of Python objects, or of a call of a "
@@ -317,6 +322,12 @@ class ComputeConfig(Section):
         description="Most MiB of elites' parameters that each worker keeps, of which it makes the policies of "
         "map_elites; what it does not keep is sent again. It never changes results.",
     )
+    worker_memory_mb: Count | None = Field(
+        None,
+        description="MiB of memory, its simulators included, above which a worker is replaced by a new process once it "
+        "has computed what it was sent; an actor with several cores has as much for each. null: no limit. It changes "
+        "no result.",
+    )
     worker_output_bytes: Count = Field(
         2**20,
         description="About how many bytes are kept of what each worker prints, its simulators included: the newest. "
@@ -331,6 +342,8 @@ class ComputeConfig(Section):
 
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
 """Keys of `compute` that affect floating-point results and are therefore constants of the run."""
+RECYCLING = "task.recycle_after_episodes"
+"""The key of `task` that changes no result."""
 ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
     "inline": {"compute.address": None, "compute.worker_resources.cpu": "auto"},
     "ray": {"compute.inline_workers": "processes"},
@@ -432,6 +445,8 @@ class RunConfig(Section):
 def is_constant(key: str) -> bool:
     """Whether resume must not change the value of a key."""
     section, _, name = key.partition(".")
+    if key == RECYCLING:
+        return False
     return section not in ("budget", "store") and (section != "compute" or name in COMPUTE_CONSTANTS)
 
 

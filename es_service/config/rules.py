@@ -95,6 +95,15 @@ def times_are_measured(config: Values, task: TaskSpec) -> Problems:
             yield not_allowed(key, limit, "null", why=f" for {task.name}, whose episodes the caller computes")
 
 
+def recycling_is_for_processes_of_users(config: Values, task: TaskSpec) -> Problems:
+    if (count := config["task.recycle_after_episodes"]) is not None and task.kind not in ("python", "function"):
+        why = f" for {task.name}, whose workers compute nothing with objects or functions of yours"
+        yield not_allowed("task.recycle_after_episodes", count, "null", why=why)
+    if (limit := config["compute.worker_memory_mb"]) is not None and config["compute.inline_workers"] == "threads":
+        why = " with compute.inline_workers = threads, which share their memory"
+        yield not_allowed("compute.worker_memory_mb", limit, "null", why=why)
+
+
 def time_limit_is_for_steps_of_unequal_times(config: Values, task: TaskSpec) -> Problems:
     if (limit := config["task.time_limit_s"]) is not None and task.kind == "jax":
         why = f" for {task.name}, whose steps take equal times"
@@ -410,6 +419,7 @@ RULES: tuple[Rule, ...] = (
     fitness_fits,
     descriptor_fits,
     choices_are_for_objects,
+    recycling_is_for_processes_of_users,
     time_limit_is_for_steps_of_unequal_times,
     times_are_measured,
     low_rank_noise_needs_matrices,

@@ -67,6 +67,8 @@ def worker_spec(
         noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
         outputs=tuple(sorted({*outputs, *search.outputs()})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
+        recycle_after_episodes=settings.recycle_after_episodes,
+        memory_bytes=compute.worker_memory_mb and compute.worker_memory_mb * 2**20,
         output_bytes=compute.worker_output_bytes,
         sources=worker_sources(*settings.code),
         platform=compute.platform,

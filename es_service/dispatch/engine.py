@@ -92,6 +92,10 @@ class Transport(Protocol):
         """
         ...
 
+    def last_words(self, worker: int) -> str:
+        """The last output of a worker that was lost by itself, if its loss does not say it; this may take seconds."""
+        ...
+
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
         """Send chunks and their centres to a worker that is up; it runs them after those that it was sent before.
 
@@ -195,6 +199,7 @@ class Engine(Generic[AnyTransport]):
 
     def last_loss(self, what: str = "") -> str:
         """See `loss_text`."""
+        self._note_last_words()
         return loss_text(self._state, what)
 
     @property
@@ -349,10 +354,17 @@ class Engine(Generic[AnyTransport]):
                 case events.Assign(worker, item_id, attempt):
                     self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:
+            if isinstance(event, events.WorkerLost):
+                self._note_last_words()
             raise EvaluationError(
                 self._state.failed + self._more(event) + (f". {self.transport.shortage()}." if is_late else "")
             )
         return accepted
+
+    def _note_last_words(self) -> None:
+        lost = self._state.last_lost
+        if lost is not None and not self._state.last_words and (words := self.transport.last_words(lost)):
+            note_last_words(self._state, lost, words)
 
     def _more(self, event: events.Event) -> str:
         """What the error that ends the run says of the work item that was lost too often with `event`."""

@@ -22,6 +22,7 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import (
     Compiled,
+    Drain,
     Failure,
     Limits,
     Placed,
@@ -36,7 +37,7 @@ from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
-from es_service.protocol.messages import Subject, Work, WorkerSpec
+from es_service.protocol.messages import Report, Subject, Work, WorkerSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.wire import Channel, framed
@@ -55,6 +56,7 @@ def inline_engine(
     alone: bool = False,
     log: Log = no_log,
     on_compile: Callable[[str, str], None] = lambda kind, text: None,
+    on_report: Callable[[str, Report], None] = lambda worker, report: None,
 ) -> Engine[ChildProcesses]:
     """Engine with `limits.workers` workers on this machine, which are starting.
 
@@ -65,8 +67,9 @@ def inline_engine(
         gpus: GPUs of each worker, or the share of one. There must be room for `limits.workers`, see `gpus.places`.
         alone: whether a process serves only runs with the same constants, whatever their seed, if it stays.
         should_stop, log, on_compile: as in `Engine`.
+        on_report: called with a worker's name and its report.
     """
-    transport = ChildProcesses(spec, threads=threads, gpus=gpus, alone=alone)
+    transport = ChildProcesses(spec, threads=threads, gpus=gpus, alone=alone, on_report=on_report)
     return Engine(transport, limits, should_stop, log, on_compile=on_compile)
 
 
@@ -93,11 +96,20 @@ class _Worker:
 class ChildProcesses:
     """Transport whose workers are child processes, or threads of one child process."""
 
-    def __init__(self, spec: WorkerSpec, *, threads: bool = False, gpus: float = 0.0, alone: bool = False) -> None:
+    def __init__(
+        self,
+        spec: WorkerSpec,
+        *,
+        threads: bool = False,
+        gpus: float = 0.0,
+        alone: bool = False,
+        on_report: Callable[[str, Report], None] = lambda worker, report: None,
+    ) -> None:
         self._spec, self._threads = framed(spec), threads
         same = repr(replace(spec, seed=0)) if alone else (spec.rollout, spec.output_bytes, *spec.sources.items())
         self._use: Hashable = same
         self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
+        self._on_report = on_report
         self._platforms: set[str] = set()
         self._parent_cache_bytes, self._output_bytes = spec.parent_cache_bytes, spec.output_bytes
         self._workers: dict[int, _Worker] = {}
@@ -138,6 +150,10 @@ class ChildProcesses:
             return ""
         child = self._forget(worker)
         return self._lose(child, f"worker {worker}, a thread of the same process, was killed", charge_items=False)
+
+    def last_words(self, worker: int) -> str:
+        """Empty, since a loss says it."""
+        return ""
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
         """Send the chunks, after those of their subjects and of the parents of policies that the worker lacks."""
@@ -257,6 +273,10 @@ class ChildProcesses:
                         self._ready.append(Compiled(number, kind, seconds))
                     case ("progress", doing, done, total):
                         self._ready.append(Progress(number, doing, done, total))
+                    case ("report", Report() as report):
+                        self._on_report(f"worker {number}", report)
+                        if report.spent:
+                            self._ready.append(Drain(number))
                     case ("results", item_id, attempt, results):
                         worker.unanswered.pop((item_id, attempt), None)
                         worker.lacking.discard((item_id, attempt))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from types import ModuleType
@@ -13,7 +13,7 @@ from typing import Any
 from es_service.dispatch.events import Progress
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce, forget_old_subjects
-from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
+from es_service.protocol.messages import FloatArray, Report, Subject, Work, recipes_in
 from es_service.protocol.recipes import Origin
 
 IN_CALL_BYTES = 64 * 2**10
@@ -88,8 +88,13 @@ class Calls(dict[Any, Call]):
 class Looks:
     """Questions to actors how far they are with their oldest calls, which they answer in a thread of its own."""
 
-    def __init__(self, ray: ModuleType) -> None:
-        self._ray = ray
+    def __init__(self, ray: ModuleType, on_report: Callable[[int, Report], None]) -> None:
+        """Know no actors yet.
+
+        Args:
+            on_report: called with a worker and its report.
+        """
+        self._ray, self._on_report = ray, on_report
         self._oldest: Mapping[int, Any] = {}
         self._asked: dict[Any, tuple[int, Any]] = {}
         """Reference to an answer -> the worker, and its oldest call when it was asked."""
@@ -119,9 +124,11 @@ class Looks:
     def _report(self, ref: Any, worker: int, call: Any, oldest: Mapping[int, Any]) -> Progress | None:
         """The report of an answer, if it shows more of a call than the one before."""
         try:
-            moves, *rest = self._ray.get(ref)
+            (moves, *rest), report = self._ray.get(ref)
         except self._ray.exceptions.RayError:  # it is lost, which its call shows
             return None
+        if report is not None:
+            self._on_report(worker, report)
         before, self._shown[worker] = self._shown.get(worker), (call, moves)
         if oldest.get(worker) != call or before in (None, (call, moves)) or before[0] != call:
             return None

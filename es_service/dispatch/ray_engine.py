@@ -10,6 +10,7 @@ call needs no shared memory. Together this halves the time that Ray adds to a ge
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
 import time
 from collections import deque
@@ -28,9 +29,16 @@ from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
-from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
+from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
 from es_service.protocol.raised import raised
 from es_service.protocol.sources import OtherCodeError
+
+MOST_GONE = 64
+"""Lost workers of which the places are known."""
+WORDS_S = 5.0
+"""Longest wait for the last lines that a lost actor has printed."""
+WORDS_BYTES = 6000
+"""At most this many bytes of them are told. After what a simulator has said, Ray prints the frames of a crash."""
 
 
 def ray_engine(
@@ -48,6 +56,7 @@ def ray_engine(
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_compile: Callable[[str, str], None] = lambda kind, text: None,
     on_refusal: Callable[[str], None] = lambda refusal: None,
+    on_report: Callable[[str, Report], None] = lambda worker, report: None,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
 
@@ -64,7 +73,7 @@ def ray_engine(
             `cpus` is given, see `ASKED_AHEAD`; if not, use the number in `limits`.
         on_wait: as in `Engine`; not called in a Ray of our own, which has room.
         on_compile: as in `Engine`.
-        on_refusal: as in `Actors`.
+        on_refusal, on_report: as in `Actors`.
 
     Raises:
         StartError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
@@ -76,8 +85,9 @@ def ray_engine(
     try:
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, grows=grows, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
+        at_once = limits.items_at_once
         transport = Actors(
-            ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, items_at_once=limits.items_at_once
+            ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, on_report, items_at_once=at_once
         )
         on_wait = (lambda shortage: None) if watch is None else on_wait
         return Engine(transport, limits, should_stop, log, on_wait, on_compile)
@@ -99,6 +109,7 @@ class Actors:
         growth: Growth | None,
         workers: int,
         on_refusal: Callable[[str], None] = lambda refusal: None,
+        on_report: Callable[[str, Report], None] = lambda worker, report: None,
         items_at_once: int = 1,
     ) -> None:
         """Make a transport without workers.
@@ -108,6 +119,7 @@ class Actors:
             growth: when the room for workers changes, `SetWorkers` follows it; None: no `SetWorkers`.
             workers: number of workers wanted at the start.
             on_refusal: called once for each host whose code is not the driver's, with what its worker said.
+            on_report: called with a worker's name and its report.
             items_at_once: number of calls that an actor answers side by side, each in a thread.
         """
         self._ray = ray
@@ -117,7 +129,7 @@ class Actors:
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls, self._arguments = Calls(ray), Arguments(ray)
-        self._looks, self._look_s = Looks(ray), time.monotonic() + LOOK_S
+        self._looks, self._look_s = Looks(ray, self._reported), time.monotonic() + LOOK_S
         self._places: dict[int, WorkerPlace] = {}
         self._planned: dict[int, str] = {}
         """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
@@ -139,6 +151,9 @@ class Actors:
         self._lacking: set[tuple[int, Hashable, int]] = set()
         """Worker, work item and attempt for which the worker has lacked parents once."""
         self._refusals = Refusals(on_refusal)
+        self._on_report = on_report
+        self._gone: dict[int, WorkerPlace] = {}
+        """Places of the workers that were lost last."""
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> place, for the workers that have one."""
@@ -161,6 +176,8 @@ class Actors:
         self._has_lost = True
         self._calls.forget(worker)
         self._up.discard(worker)
+        if worker in self._places:
+            self._gone = dict([*self._gone.items(), (worker, self._places[worker])][-MOST_GONE:])
         for known in (self._places, self._planned, self._compiled, self._parents):
             known.pop(worker, None)
         if (handle := self._handles.pop(worker, None)) is not None:
@@ -168,6 +185,18 @@ class Actors:
                 self._ray.kill(handle, no_restart=True)
         self._to_ask = set(self._handles)
         return ""
+
+    def last_words(self, worker: int) -> str:
+        """The last lines that a lost actor has printed, if its node still answers within WORDS_S."""
+        place, nodes = self._gone.pop(worker, None), None if self._watch is None else self._watch.latest().alive
+        if place is None or not place.logs or (nodes and place.node not in nodes):
+            return ""
+        affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(place.node, soft=False)
+        read = self._ray.remote(num_cpus=0, max_retries=0)(ends_of_files).options(scheduling_strategy=affinity)
+        try:
+            return self._ray.get(read.remote(place.logs, WORDS_BYTES), timeout=WORDS_S)
+        except self._ray.exceptions.RayError:  # also if it takes too long
+            return ""
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
         """Call the actor, first to compile if it has no chunks of this kind so far.
@@ -276,7 +305,10 @@ class Actors:
                 self.send(*item, call.work)
                 return None
             self._lacking.discard(item)
-            return Answer(call.worker, call.item_id, call.attempt, value)
+            results, report = value
+            if report is not None:
+                self._reported(call.worker, report)
+            return Answer(call.worker, call.item_id, call.attempt, results)
         if call.what == "compile":
             return Compiled(call.worker, call.kind, value)
         if call.what == "build":
@@ -288,6 +320,13 @@ class Actors:
         self._planned.pop(call.worker, None)
         self._followed = None
         return None if is_known else Placed(call.worker)
+
+    def _reported(self, worker: int, report: Report) -> None:
+        """Pass on a worker's report; it is drained if it should be replaced."""
+        self._on_report(f"worker {worker} on {self._place(worker)}", report)
+        if report.spent and worker not in self._drained:
+            self._drained.add(worker)
+            self._inbox.append(Drain(worker))
 
     def _place(self, worker: int) -> str:
         """Where a worker is, in words."""
@@ -342,13 +381,23 @@ class Actors:
         return WorkerLost(worker, reason, charge_item=has_begun, refused=refused, traceback=traceback)
 
 
+def ends_of_files(files: Sequence[str], most_bytes: int) -> str:
+    """The last lines of files of this host, together at most `most_bytes`; of those that can be read."""
+    texts = []
+    for name in files:
+        with contextlib.suppress(OSError), open(name, "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - most_bytes // len(files)))
+            texts.append(file.read().decode(errors="replace").strip())
+    return "\n".join(filter(None, texts))
+
+
 def _read(what: str, value: Any) -> Any:
     """What a worker has answered to a call, where None of `run` says that it lacks parents of policies. Raises any
     exception for a message that no worker of ours sends."""
     match what:
         case "run":
-            results = pickle.loads(value)
-            return None if results is None else list(results)
+            answer = pickle.loads(value)
+            return None if answer is None else (list(answer[0]), answer[1])
         case "place":
             return WorkerPlace(*value)
         case "compile":

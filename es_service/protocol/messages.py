@@ -162,6 +162,10 @@ class WorkerSpec:
     they are those of a task in JAX; no run does so."""
     parent_cache_bytes: int = 2**28
     """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
+    recycle_after_episodes: int | None = None
+    """Episodes after which each core of a worker should be a new process; None: any number."""
+    memory_bytes: int | None = None
+    """Memory, for each core, above which a worker should be replaced by a new process; None: any amount."""
     output_bytes: int = 2**20
     """Most bytes that are kept of what its process prints; see `newest_output.py`."""
     sources: dict[str, str] = field(default_factory=dict)
@@ -175,6 +179,15 @@ class WorkerSpec:
         return task_code(self.environment, self.choices.descriptor, self.environment_options)
 
 
+class Report(NamedTuple):
+    """What a worker tells besides results."""
+
+    printed: str
+    """The newest lines that its process and others that it started have printed since the last report."""
+    spent: str
+    """Why it should be replaced by a new process, as a clause about it; empty if it should not."""
+
+
 class WorkerPlace(NamedTuple):
     """Host and process of a worker."""
 
@@ -182,6 +195,8 @@ class WorkerPlace(NamedTuple):
     pid: int
     node: str
     """Ray's id of the cluster node."""
+    logs: tuple[str, ...] = ()
+    """Files there with what it prints."""
 
     def __str__(self) -> str:
         return f"{self.host} (pid {self.pid})"

@@ -64,6 +64,22 @@ def peak_memory_mib() -> int:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit / 1024)
 
 
+def memory_of_tree_bytes() -> int:
+    """Memory of this process and of all that it has started, directly or not; 0 where only Linux says it."""
+    parents: dict[int, int] = {}
+    pages: dict[int, int] = {}
+    with suppress(OSError):
+        for entry in os.scandir("/proc"):
+            if entry.name.isdigit():
+                with suppress(OSError, ValueError, IndexError):  # it has just ended
+                    fields = Path(entry.path, "stat").read_text().rpartition(")")[2].split()
+                    parents[int(entry.name)], pages[int(entry.name)] = int(fields[1]), int(fields[21])
+    ours = {os.getpid()}
+    while found := {process for process, parent in parents.items() if parent in ours} - ours:
+        ours |= found
+    return os.sysconf("SC_PAGE_SIZE") * sum(pages.get(process, 0) for process in ours)
+
+
 def process_start_s() -> float:
     """When this process started, in seconds since the epoch; up to a second too early where only `ps` says it."""
     try:

@@ -25,7 +25,7 @@ from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Compiled, Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.protocol.machine import platform_info, platform_text
-from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.messages import Report, WorkerSpec
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.signals import stop_on_signals
@@ -55,6 +55,7 @@ def make_engine(
     on_refusal: Callable[[str], None] = lambda refusal: None,
     on_compile: Callable[[str], None] = lambda sentence: None,
     *,
+    on_report: Callable[[str, Report], None] = lambda worker, report: None,
     at_once: int | None = None,
     outputs: tuple[str, ...] = (),
     keyed_resets: bool = False,
@@ -66,6 +67,7 @@ def make_engine(
         on_refusal: as in `ray_engine`.
         on_compile: called with a sentence when workers compile, or make environments, for more than two seconds, and
             with "" when they go on.
+        on_report: called with a worker's name and its report.
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
         outputs, keyed_resets: see `WorkerSpec`.
     """
@@ -84,7 +86,15 @@ def make_engine(
     engine: Engine[Any]
     if compute.engine == "inline":
         engine = inline_engine(
-            spec, limits, should_stop, threads=threads, gpus=gpus, alone=alone, log=log, on_compile=tell_compiling
+            spec,
+            limits,
+            should_stop,
+            threads=threads,
+            gpus=gpus,
+            alone=alone,
+            log=log,
+            on_compile=tell_compiling,
+            on_report=on_report,
         )
     else:
         from es_service.dispatch.ray_engine import ray_engine
@@ -103,6 +113,7 @@ def make_engine(
             on_wait=on_wait,
             on_compile=tell_compiling,
             on_refusal=on_refusal,
+            on_report=on_report,
         )
     if task.kind in ("python", "function"):  # errors name the episodes or the calls that ended workers
         engine.describe = partial(described, spec, task.parameters)

@@ -17,7 +17,7 @@ from es_service.loop.history import Row
 from es_service.runs.certified import all_certifications, failed_tries, target_reached
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG, DATABASE, runs_inside
-from es_service.store.lock import last_end, lock_holder
+from es_service.store.lock import last_end, last_output, lock_holder
 from es_service.store.reader import read_history, read_newest
 
 TARGET = "target_certified"
@@ -45,6 +45,8 @@ class RunStatus:
     """Mean fitness of each policy that did not reach it in new episodes, in order."""
     end: str = ""
     """How the last session ended, in words, if there is no driver; empty if it is not known."""
+    output: tuple[str, ...] = ()
+    """The newest lines that workers have printed, each after its worker."""
     durations: tuple[float, ...] = ()
     """`budget.durations` of the newest generations, if a limit of the time needs them."""
 
@@ -99,7 +101,7 @@ def status_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Ru
         pass  # damage of a certification, which `verify` names
     end, limits = "" if driver else last_end(run.folder), limits_of(budget)
     recent = recent_durations(run.folder, limits, row)
-    return RunStatus(run, driver, row, limits, "", certified, target, tries, end, recent)
+    return RunStatus(run, driver, row, limits, "", certified, target, tries, end, last_output(run.folder), recent)
 
 
 def recent_durations(folder: Path, limits: Mapping[str, float], row: Row | None) -> tuple[float, ...]:

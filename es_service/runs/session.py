@@ -22,6 +22,7 @@ from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.runs.engine import make_engine
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
+from es_service.runs.reports import reader_of_reports
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.strangers import require_sound_state
 from es_service.runs.view import Run, open_run
@@ -67,6 +68,7 @@ def work(
     on_generation: OnGeneration,
     on_notice: OnNotice,
     on_compile: OnNotice,
+    on_output: OnNotice,
     *,
     strict: bool = False,
     asks_caller: bool = False,
@@ -77,6 +79,7 @@ def work(
     Args:
         on_compile: called with a sentence when workers compile, or make or reset environments, for some time, and
             before centroids are placed for some time.
+        on_output: called with each line that a worker prints, after the worker.
         strict: whether workers on another platform than the run's are an error.
         asks_caller: whether work is yielded, because the task has no episodes of its own.
     """
@@ -141,7 +144,15 @@ def work(
         nullcontext(lambda: None) if asks_caller else stop_on_signals() as should_stop,
         nullcontext()
         if asks_caller
-        else make_engine(config, should_stop, log, tell_wait, tell, tell_compiling) as engine,
+        else make_engine(
+            config,
+            should_stop,
+            log,
+            tell_wait,
+            tell,
+            tell_compiling,
+            on_report=reader_of_reports(store.lock, tell, on_output),
+        ) as engine,
     ):
 
         def tell_failed(failures: Sequence[str]) -> None:

@@ -43,6 +43,7 @@ class Listener:
     """Function from a run's folder to a context manager with what is called with each history row."""
     on_notice: OnNotice
     on_compile: OnNotice
+    on_output: OnNotice
     hook: Callable[[str], None] = no_hook
     asks_caller: bool = False
     """Whether the caller computes the episodes, to whom the sessions yield their work."""
@@ -86,7 +87,7 @@ def create_run(
         begun = store.generation
         try:
             until = targets.until_due(on_generation, targets.due(folder, config))
-            told = listener.on_notice, listener.on_compile
+            told = listener.on_notice, listener.on_compile, listener.on_output
             outcome = yield from work(config, store, until, *told, asks_caller=listener.asks_caller)
         except StartError as error:
             if store.generation != begun:
@@ -168,6 +169,6 @@ def _session(
             return config, Outcome(open_run(folder), targets.TO_CERTIFY, is_finished=False)
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, is_due)
-            told = listener.on_notice, listener.on_compile
+            told = listener.on_notice, listener.on_compile, listener.on_output
             outcome = yield from work(config, store, until, *told, strict=strict, asks_caller=listener.asks_caller)
             return config, outcome

@@ -14,7 +14,7 @@ import os
 import socket
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
 """Seconds for which a writer tries to take the lock, because `lock_holder` holds a shared lock for an instant."""
-_MOST, _MOST_WORDS = 4096, 500
+_MOST, _MOST_WORDS = 16384, 500
 """Bytes of the file that are read, and characters of the words about an end, each of which takes at most six bytes."""
+MOST_LINES, MOST_LINE = 8, 160
+"""Lines of what workers print that the file has, and characters of each."""
 _OF_HOLDER = ("host", "pid", "since", "waiting_since", "doing")
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _held: weakref.WeakSet[RunLock] = weakref.WeakSet()
@@ -38,6 +40,7 @@ class RunLock:
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._end = _content(os.pread(descriptor, _MOST, 0))
+        self._output, self._said = "", {}
         self._identity = {"host": socket.gethostname(), "pid": os.getpid(), "since": _now()}
         self.say()
         _held.add(self)
@@ -45,7 +48,15 @@ class RunLock:
     def say(self, *, waiting: bool = False, doing: str = "") -> None:
         """Write who holds the lock into its file, since when the run has been waiting for a worker, if it is, and what
         it is doing if that takes long and nothing else shows it."""
-        self._write(self._identity | {"waiting_since": _now() if waiting else None, "doing": doing})
+        self._said = {"waiting_since": _now() if waiting else None, "doing": doing}
+        self._write(self._identity | self._said)
+
+    def note_output(self, lines: Iterable[str], *, write: bool = True) -> None:
+        """Keep the newest lines that workers have printed, for `last_output`; write them into the file now, or with
+        what is said next."""
+        self._output = "\n".join(lines)
+        if write:
+            self._write(self._identity | self._said)
 
     def note_end(self, how: str) -> None:
         """Keep how the session ends, in words, for `last_end`."""
@@ -61,6 +72,7 @@ class RunLock:
         # The lock itself is enough; on a full disk its file does not name the writer.
         with contextlib.suppress(OSError):
             # Half of a surrogate pair, which a file's name may have, is no UTF-8: it is escaped as JSON does it.
+            content = {**content, "output": self._output} if self._output else content
             text = json.dumps(content, ensure_ascii=False).encode(errors="backslashreplace")
             # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
             os.pwrite(self._descriptor, text.ljust(os.fstat(self._descriptor).st_size), 0)
@@ -159,6 +171,15 @@ def last_end(folder: Path) -> str:
     if "pid" not in content:
         return ""
     return f"its driver on {content.get('host')}, pid {content['pid']}, was killed, or its host failed"
+
+
+def last_output(folder: Path) -> tuple[str, ...]:
+    """The newest lines that the workers of a run's present or last session have printed, each after its worker."""
+    try:
+        content = _content((folder / LOCK).read_bytes()[:_MOST])
+    except OSError:
+        return ()
+    return tuple(str(content.get("output") or "").splitlines())
 
 
 def _content(text: bytes) -> dict[str, Any]:

@@ -69,6 +69,9 @@ class Scripted:
     def start(self, worker):
         self.inbox.append(WorkerUp(worker))
 
+    def last_words(self, worker):
+        return ""
+
     def kill(self, worker):
         self.killed.append(worker)
         return self.last_words.get(worker, "")

@@ -170,6 +170,13 @@ def test_a_module_that_is_not_found_here_is_refused_before_anything_is_sent(own,
             submitted("--set", f"{key}={module}:Name")
 
 
+def test_a_job_is_told_as_a_line_of_json(own, submitted):
+    _, printed = submitted("--set", OWN, "--json")
+    told = json.loads(printed.splitlines()[-1])
+    assert (told["job"], told["folder"], told["expected"]) == ("es-1", "/runs/x", ["sortedcontainers"])
+    assert "sent_searches/first.py" in told["sent"]
+
+
 def test_shipped_tasks_and_searches_send_nothing(own, submitted):
     package, printed = submitted()
     assert (package.files, package.expected) == ({}, ())
@@ -186,8 +193,8 @@ def test_a_sweep_is_sent_with_its_options_and_the_modules_of_all_its_runs(own, s
     assert "sent_searches/first.py" in package.files
     out: list[Any] = []
 
-    def took(config, out_, wanted, values, seeds, parallel, options):
-        out.append((str(config), str(out_), wanted, values, seeds, parallel))
+    def took(configs, out_, wanted, values, seeds, parallel, options, certifying, as_json):
+        out.append((str(configs[0].source), str(out_), wanted, values, seeds, parallel))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep, "run_sweep", took)

@@ -31,7 +31,7 @@ from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.kept_subjects import KEPT_SUBJECTS
-from es_service.protocol.messages import EvaluationChunk, TrainingChunk, with_subject
+from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, with_subject
 from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters
 
@@ -69,7 +69,9 @@ class Actor:
     ran: int = 0
     """Chunks."""
     seen: tuple[Any, str, int, int] = (0, "", 0, 0)
-    """What it answers when it is asked how far it is, while it does not hang."""
+    """What it answers when it is asked how far it is, while it does not hang, with"""
+    report: Report | None = None
+    """its report, which is that of a call of `run`, too."""
 
 
 @dataclass(eq=False)
@@ -153,10 +155,14 @@ class PretendedRay:
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
             "compile": lambda chunks, *centres: 0.0,
-            "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)[1]]),
+            "run": lambda chunks, *centres: pickle.dumps(
+                ([f"of {chunk}" for _, chunk in pickle.loads(chunks)[1]], actor.report)
+            ),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
-        looked = SimpleNamespace(remote=lambda: Ref(actor.seen, is_ready=actor.state in ("alive", "busy")))
+        looked = SimpleNamespace(
+            remote=lambda: Ref((actor.seen, actor.report), is_ready=actor.state in ("alive", "busy"))
+        )
         calls["progress"] = SimpleNamespace(options=lambda concurrency_group: looked)
         return SimpleNamespace(itself=actor, **calls)
 
@@ -590,7 +596,8 @@ def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_whil
 def test_an_actor_is_asked_how_far_it_is_with_a_call_that_takes_long():
     """At each look but the first of a call. Its answer counts if it has changed and the call is still the oldest."""
     ray = PretendedRay()
-    looks, first, second = Looks(ray), Ref(), Ref()
+    reports = []
+    looks, first, second = Looks(ray, lambda *report: reports.append(report)), Ref(), Ref()
     handle = ray.remote()(type(None)).options("SPREAD").remote(b"", 0, 0.0, 1)
 
     def look(call: Ref, moves: int) -> list[Progress]:
@@ -604,6 +611,25 @@ def test_an_actor_is_asked_how_far_it_is_with_a_call_that_takes_long():
     assert [look(second, 5), look(second, 6), look(second, 7)] == [[], [], []], "an answer to the call before is none"
     assert look(second, 7) == [Progress(0, "making", 7, 9)]
     assert looks.look({}, {}) == [], "it has been killed"
+    assert not reports
+    ray.actors[0].report = Report("a line", "")
+    for _ in range(3):
+        look(first, 8)
+    assert reports == [(0, Report("a line", ""))]
+
+
+def test_an_actor_that_says_that_it_is_spent_is_drained_once_and_replaced_which_is_no_fault():
+    ray, told = PretendedRay(), []
+    engine = ray_engine(ray, Limits(1))
+    engine.transport._on_report = lambda *report: told.append(report)
+    with engine:
+        engine.evaluate(with_subject(FIRST, [CHUNK]))
+        ray.actors[0].report = Report("a line", "it leaks")
+        for _ in range(3):
+            assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        assert [actor.state for actor in ray.actors] == ["dead", "alive"]
+        assert engine.counts.lost_workers == engine.counts.retries == 0
+    assert {*told} == {("worker 0 on host (pid 0)", Report("a line", "it leaks"))}
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
     words = ("bench", "rollouts", "--task", "point_maze", "--batch", 8, "--seconds", 0, "--json")
     code, printed = es(*words, COLUMNS="80")
     assert code == 0, printed
-    rows = json.loads(printed)
+    rows = [json.loads(line) for line in printed.splitlines()]
     assert {row["policy"] for row in rows} == {"on", "off"}
     assert {(row["policy"], row["rollout"]) for row in rows} == set(itertools.product(("on", "off"), ("xla", "simd")))
     assert {(row["task"], row["batch"], row["cores"]) for row in rows} == {("point_maze", 8, 1)}
@@ -72,7 +72,7 @@ def test_bench_scaling_predicts_a_row_per_number_of_workers():
     config = ("point_maze_es", "--set", "search.pairs=512")
     code, printed = es("bench", "scaling", *config, "--workers", "1,4,128", "--cores-per-node", 32, "--json")
     assert code == 0, printed
-    rows = json.loads(printed)
+    rows = [json.loads(line) for line in printed.splitlines()]
     assert [row["workers"] for row in rows] == [1, 4, 128]
     assert all(
         set(row) == {"workers", "seconds_per_generation", "steps_per_second", "efficiency", "limit"} for row in rows
@@ -94,7 +94,7 @@ def test_bench_scaling_predicts_a_method_that_asks_for_policies():
     config = ("point_maze_map_elites", "--set", "search.batch=72", "--set", "search.evaluation_episodes=3")
     code, printed = es("bench", "scaling", *config, "--workers", "1,64", "--json")
     assert code == 0, printed
-    one, many = json.loads(printed)
+    one, many = map(json.loads, printed.splitlines())
     assert 0.0 < one["efficiency"] <= 1.0, "messages cost much beside chunks that take a millisecond"
     assert many["efficiency"] < 0.3, "there are fourteen chunks"
     assert min(one["steps_per_second"], many["steps_per_second"]) > 0

@@ -16,6 +16,7 @@ from es_service.config.given import shipped_configs
 from es_service.errors import ConfigError
 from es_service.runs.jobs import Job
 from es_service.store.digest import checked_parts
+from tests.system.command_line import command
 from workers.environments import SHIPPED
 
 
@@ -94,6 +95,37 @@ def test_numbers_that_json_does_not_have_are_null(capsys):
     assert json.loads(capsys.readouterr().out) == {"a": [None, None, 1.5], "b": [1, True, None]}
 
 
-@pytest.mark.parametrize("words", [("status",), ("list",), ("digest",), ("doctor",), ("jobs",), ("verify",)])
-def test_each_command_that_prints_a_table_has_the_option(words):
-    assert "--json" in CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "200"}).output
+@pytest.mark.parametrize(
+    "name", ["status", "list", "digest", "doctor", "jobs", "verify", "run", "resume", "fork", "sweep", "submit"]
+)
+def test_each_command_that_prints_a_table_has_the_option(name):
+    assert "--json" in CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "200"}).output
+
+
+def test_a_run_and_a_sweep_print_a_line_for_each_row(tmp_path, one_process):
+    small = ["point_maze_es", "--engine", "inline", "--set", "search.pairs=2", "--set", "search.evaluation_episodes=1"]
+    small += ["--set", "task.episode_steps=5", "--set", "budget.generations=2", "--set", "policy.hidden=[4]"]
+
+    def lines(*words):
+        result = CliRunner().invoke(app, [*words, "--json"], catch_exceptions=False)
+        assert result.exit_code == 0
+        return [json.loads(line) for line in result.stdout.splitlines()]
+
+    *rows, end = lines("run", *small, "--out", str(tmp_path / "run"))
+    assert [row["generation"] for row in rows] == [0, 1, 2]
+    assert end == {"run": str(tmp_path / "run"), "is_finished": True, "reason": end["reason"]}
+    *rows, end = lines("resume", str(tmp_path / "run"), "--set", "budget.generations=3")
+    assert [row["generation"] for row in rows] == [3]
+
+
+@pytest.mark.slow
+def test_a_sweep_prints_a_line_for_each_run_that_has_changed_and_the_comparison(tmp_path):
+    words = ["sweep", "point_maze_es", "--engine", "inline", "--set", "search.pairs=2", "--set", "task.episode_steps=5"]
+    words += ["--set", "budget.generations=1", "--seeds", "0:2", "--out", str(tmp_path / "swept"), "--json"]
+    result = command(*words)
+    assert result.returncode == 0, result.stderr
+    told = [json.loads(line) for line in result.stdout.splitlines()]
+    states = {(line["run"], line["state"]) for line in told if "run" in line}
+    assert {("seed=0", "running"), ("seed=0", "finished"), ("seed=1", "finished")} <= states
+    assert told[-1] == {"report": str(tmp_path / "swept" / "report.html")}
+    assert {line["newest"]["generation"] for line in told if line.get("state") == "finished"} == {1}

@@ -84,6 +84,17 @@ class Loud(Drift):
         return super().step(action)
 
 
+class Leaky(Drift):
+    """A drift that takes more memory in each episode and gives none back, and prints in colour."""
+
+    leaked: list[bytearray] = []  # noqa: RUF012
+
+    def reset(self, seed):
+        os.write(1, b"\x1b[31mreset with %d\x1b[0m\n" % seed)
+        self.leaked.append(bytearray(os.urandom(2**20)))
+        return super().reset(seed)
+
+
 class Slow(Drift):
     """A drift whose first step in a worker that finds a file with this process's kind of fault has that fault."""
 

@@ -11,8 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from es_service import api, load_config
+from es_service.cli.main import app
 from es_service.config.tasks import TASKS, task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -515,6 +517,25 @@ def test_a_new_object_for_each_episode_carries_nothing_over_and_old_ones_are_clo
             alone.reset(1)
             assert np.array_equal(steps[0], alone.step(0.3 * np.ones(1))[0]) is is_new
             assert len(closed) == is_new
+
+
+@pytest.mark.slow
+def test_workers_that_leak_are_replaced_and_what_they_print_is_seen_and_no_bit_changes(tmp_path):
+    config = config_of(f"python:{MODULE}:Leaky") | {"map": {"enabled": False}}
+    notices, lines, digests = [], [], set()
+    for count in (None, 40):
+        given = load_config(config, {"task.recycle_after_episodes": count})
+        run = api.run(given, tmp_path / str(count), on_notice=notices.append, on_output=lines.append).run
+        digests.add(run.digest())
+        assert run.history.lost_workers.sum() == run.history.retries.sum() == 0
+    assert len(digests) == 1
+    (notice,) = notices
+    assert re.match(r"worker \d is replaced by a new process, since it has computed \d+ episodes \(task\.", notice)
+    assert all(re.fullmatch(r"worker \d+: reset with \d+", line) for line in lines)
+    assert len({line.partition(":")[0] for line in lines}) > 2
+    shown = CliRunner().invoke(app, ["status", str(tmp_path / "40")]).stdout
+    assert re.search(r"newest lines .* printed:\n  worker \d+: reset with \d+\n", shown)
+    api.resume(tmp_path / "40", {"task.recycle_after_episodes": 1000, "budget.generations": 5})
 
 
 @pytest.mark.parametrize("is_new", [False, True])
