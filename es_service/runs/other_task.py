@@ -26,7 +26,7 @@ from es_service.runs.selection import kept
 ENVIRONMENT = "task.environment"
 MAY_SET = ("task.descriptor", "task.time_limit_s", "compute.rollout")
 """Keys of the other task that may be set besides its options. All else is as in the run."""
-OBSERVATION = "observation"
+OBSERVATION = ("observation", "contact_force")
 """What the names of options say that change what a policy sees, in Gymnasium's environments and ours."""
 
 
@@ -142,20 +142,21 @@ def _config(config: RunConfig, name: str, declared: TaskSpec | None) -> dict[str
 
 def _unequal(config: RunConfig, here: TaskSpec, there: TaskSpec, options: Mapping[str, OptionValue]) -> list[Problem]:
     """What must be equal for a policy to run in both tasks, and is not."""
+    seen: dict[str, tuple[Any, Any]] = {
+        f"{TASK_OPTIONS}{option}": (config.task.options.get(option, here.options[option].default), value)
+        for option, value in options.items()
+        if option in here.options and any(part in option for part in OBSERVATION)
+    }
     compared: dict[str, tuple[Any, Any]] = {
         "the parameters and their bounds": (_parameters(here), _parameters(there)),
-        "the size of an observation": (here.observation_size, there.observation_size),
         "the size of an action": (here.action_size, there.action_size),
         "the bounds of the actions": (_bounds(here), _bounds(there)),
     }
-    compared |= {
-        f"{TASK_OPTIONS}{option}": (config.task.options[option], value)
-        for option, value in options.items()
-        if OBSERVATION in option and option in config.task.options
-    }
+    if all(of_run == other for of_run, other in seen.values()):  # else they are the reason for another size
+        compared["the size of an observation"] = here.observation_size, there.observation_size
     return [
         Problem(f"{what}: {show(of_run)} in {here.name}, but {show(other)} in {there.name}", ENVIRONMENT, there.name)
-        for what, (of_run, other) in compared.items()
+        for what, (of_run, other) in (compared | seen).items()
         if of_run != other
     ]
 

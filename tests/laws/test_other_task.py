@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -150,6 +151,38 @@ def test_what_does_not_fit_the_policies_is_refused_before_workers_start(
     monkeypatch.delattr(certification, "engine_here")
     with pytest.raises(ConfigError, match=message):
         certify_run(of_python.folder, task=f"{TASKS}{task}", overrides=overrides)
+
+
+CONTACT = "task.options.include_cfrc_ext_in_observation: true in gymnasium:Ant-v5, but false in gymnasium:Ant-v5"
+RANGE = r"task.options.contact_force_range: null in gymnasium:Ant-v5, but \[-2, 2\] in gymnasium:Ant-v5"
+FORCES = "task.options.contact_forces: zero in ant_trap, but computed in gymnasium:es_service/AntTrapMujoco-v0"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("here", "there", "overrides", "sentence"),
+    [
+        ("gymnasium:Ant-v5", "gymnasium:Ant-v5", ["include_cfrc_ext_in_observation=false"], CONTACT),
+        ("gymnasium:Ant-v5", "gymnasium:Ant-v5", ["contact_force_range=[-2, 2]"], RANGE),
+        ("ant_trap", "gymnasium:es_service/AntTrapMujoco-v0", ["contact_forces=computed"], FORCES),
+        ("gymnasium:Ant-v5", "gymnasium:Ant-v5", ["frame_skip=2"], None),
+        ("ant_trap", "gymnasium:es_service/AntTrapMujoco-v0", [], None),
+    ],
+)
+def test_options_of_observations_are_refused_in_one_sentence(here, there, overrides, sentence):
+    """Also where they change the size of an observation. Another frame skip is another task, which may be asked for."""
+    given = {"task": {"environment": here}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+    of_trap = ["task.options.physics=mujoco", "task.options.contact_forces=zero"] if here == "ant_trap" else []
+    config = api.load_config({**given, "map": {"enabled": False}}, of_trap)
+    options = [f"task.options.{option}" for option in overrides]
+    if sentence is None:
+        found = other_task(config, there, options).config.task.options
+        assert found["frame_skip" if overrides else "contact_forces"] == (2 if overrides else "zero")
+        return
+    with pytest.raises(ConfigError) as caught:
+        other_task(config, there, options)
+    [problem] = caught.value.problems
+    assert re.fullmatch(sentence, problem.sentence)
 
 
 def test_other_sizes_name_both_tasks(finished):
