@@ -13,9 +13,12 @@ import jax
 import numpy as np
 
 from es_service.protocol.noise import Domain, stream_keys
+from tests.mujoco_models import Example
 from workers.environments import SHIPPED, make_environment
 from workers.environments.ant_gymnasium import AntMazeEnv, AntTrapEnv, MujocoAntEnv
-from workers.environments.ant_model import boxes_of
+from workers.environments.ant_model import SUBSTEPS, boxes_of, compiled
+from workers.environments.mujoco_parts import MujocoState, mujoco
+from workers.environments.wall_boxes import SLOTS, wall_contacts
 from workers.simd.episodes.kernel import compile_kernel
 
 ENVIRONMENTS: dict[str, type[MujocoAntEnv]] = {"ant_maze": AntMazeEnv, "ant_trap": AntTrapEnv}
@@ -124,6 +127,20 @@ def resets_of(task: str) -> Callable[..., Any]:
 def resets(task: str, count: int) -> Any:
     """States [N] of resets."""
     return resets_of(task)(stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(count)))
+
+
+def example(task: str, integrator: str = "RK4") -> Example:
+    """The model of a task for `tests.benchmarks.mujoco`, with its own integrator or another one."""
+    box_W_4 = boxes(task)
+    of_c, of_mjx = compiled(box_W_4), compiled(box_W_4[:SLOTS])
+    for model in (of_c, of_mjx):
+        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+
+    def states_of(count: int, seed: int) -> MujocoState:
+        qpos, qvel, _ = states(task, count, seed)
+        return MujocoState(qpos, qvel, np.zeros((count, 0)), np.zeros_like(qvel), np.zeros(count, np.float32))
+
+    return Example(of_c, SUBSTEPS, "", of_mjx, wall_contacts(box_W_4), states_of, task)
 
 
 def put(state: Any, qpos: np.ndarray, qvel: np.ndarray) -> Any:

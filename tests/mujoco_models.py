@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -52,6 +54,14 @@ class Example(NamedTuple):
     substeps: int
     note: str = ""
     """What is not as its authors set it."""
+    of_mjx: MjModel | None = None
+    """What MJX gets, with `contacts`; None: the model itself."""
+    contacts: Mapping[Any, Any] = MappingProxyType({})
+    """As of `mujoco_parts.step_and_look`."""
+    states: Callable[[int, int], MujocoState] | None = None
+    """Function (number, seed) of states; None: those of `c_states`."""
+    spring: str = ""
+    """The same task with Brax's springs; empty if there is none."""
 
 
 def folder_of(name: str, near: Path | None = None) -> Path | None:

@@ -32,6 +32,7 @@ import numpy as np
 import pandas as pd
 
 from es_service.protocol.machine import cpu_kind, platform_info
+from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.process_environment import worker_environment
 
 RESULTS = Path(__file__).parent / "results" / "mujoco.csv"
@@ -43,15 +44,19 @@ WORLDS, HORIZON = 32, 10
 """Rollouts of C MuJoCo side by side, and control steps of each."""
 STATES = 1000
 Call = Callable[[], object]
-SIDES = ("simd", "c", "c_own", "xla")
-"""Columns of rates: ours, `mujoco.rollout` with the same settings and with its own, and xla."""
+SIDES = ("simd", "c", "c_own", "xla", "spring")
+"""Columns of rates: ours, `mujoco.rollout` with the same settings and with its own, xla, and by simd the same task with
+Brax's springs."""
 
 
+BESIDE = {"c": "/ C, same settings", "c_own": "/ C, its own", "xla": "/ xla", "spring": "/ springs"}
+"""Side -> head of the column of how many times as fast simd is."""
 ERRORS = ("contact_median", "contact_p99", "contact_max", "free_p99", "ulp_p99")
 
 
 def rows() -> dict[str, Callable[[Path | None], Any]]:
     """Row -> its `Example`, or None if its files are not there, given the folder of Playground."""
+    from tests import mujoco_ants as ants
     from tests import mujoco_models as models
 
     def as_c(example: Any) -> Any:
@@ -66,6 +71,9 @@ def rows() -> dict[str, Callable[[Path | None], Any]]:
         f"playground:{name}": lambda near, of=name: models.of_playground(of, near) for name in models.OF_PLAYGROUND
     }
     made |= {f"gymnasium:{name}": lambda _, of=name: models.of_gymnasium(of) for name in models.OF_GYMNASIUM}
+    for task in ants.ENVIRONMENTS:
+        for integrator in ("RK4", "Euler"):
+            made[f"{task} {integrator}"] = lambda _, a=task, b=integrator: ants.example(a, b)
     return made
 
 
@@ -79,18 +87,19 @@ def measure(row: str, near: Path | None, sides: Sequence[str], folder: Path, all
     import jax
 
     from tests import mujoco_models as models
-    from workers.environments import mujoco_parts
+    from workers.environments import make_environment, mujoco_parts
     from workers.simd.backend.native import aligned, pack
     from workers.simd.episodes.kernel import compile_kernel
 
     example = rows()[row](near)
     model, substeps = example.model, example.substeps
     own = models.as_c(model)
-    mjx_model = mujoco_parts.put_model(model, all_pairs=all_pairs)
+    mjx_model = mujoco_parts.put_model(example.of_mjx or model, all_pairs=all_pairs)
     data: Any = mujoco_parts.mjx.make_data(mjx_model)
 
     def step(state: Any, ctrl: Any) -> Any:
-        return mujoco_parts.step(mjx_model, state, ctrl, substeps)
+        look, contacts = (lambda data: ()), example.contacts
+        return mujoco_parts.step_and_look(mjx_model, state, ctrl, substeps, look, contacts=contacts)[0]
 
     started, cpu_started = time.perf_counter(), time.process_time()
     kernel = compile_kernel(step, mujoco_parts.start(mjx_model), np.zeros(model.nu, np.float32), folder=folder)
@@ -107,13 +116,24 @@ def measure(row: str, near: Path | None, sides: Sequence[str], folder: Path, all
     }
     if not meet:
         result |= _errors(models, kernel, example, own)
-    states = models.c_states(model, substeps, MOST, seed=1)
+    states = _states(models, example, MOST, 1)
     given = states, models.random_ctrl(model, MOST, np.random.default_rng(1))
 
     def call_of_simd(batch: int) -> Call:
         words = pack([leaf[:batch] for leaf in jax.tree.leaves(given)], kernel.target.width)
         out = aligned((len(words), kernel.words_out, kernel.target.width))
         return lambda: kernel.run(words, out)
+
+    def call_of_spring(batch: int) -> Call:
+        environment = make_environment(example.spring, {})
+        keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
+        begun = compile_kernel(environment.reset, keys[0], folder=folder)(keys)
+        action = np.random.default_rng(1).uniform(-1.0, 1.0, (batch, model.nu)).astype(np.float32)
+        first = jax.tree.map(lambda leaf: leaf[0], (begun, action))
+        stepped = compile_kernel(lambda *of: environment.step(*of)[0], *first, folder=folder)
+        words = pack(jax.tree.leaves((begun, action)), stepped.target.width)
+        out = aligned((len(words), stepped.words_out, stepped.target.width))
+        return lambda: stepped.run(words, out)
 
     compiled = jax.jit(jax.vmap(step))
 
@@ -129,20 +149,28 @@ def measure(row: str, near: Path | None, sides: Sequence[str], folder: Path, all
         if side in sides:
             runs[side] = max(((batch, call_of(batch)) for batch in batches), key=lambda run: _rate(*run))
             result[f"{side}_batch"] = runs[side][0]
+    if "spring" in sides and example.spring:
+        runs["spring"] = MOST, call_of_spring(MOST)
     if meet:
         print("ready", flush=True)
         sys.stdin.readline()
-    rates: dict[str, list[float]] = {side: [] for side in SIDES if side in sides}
+    rates: dict[str, list[float]] = {side: [] for side in SIDES if side in sides and side in runs}
     for number in range(ROUNDS):
         for side in list(rates)[:: 1 if number % 2 else -1]:
             rates[side].append(_rate(*runs[side]))
     return result | {"rates": rates}
 
 
+def _states(models: Any, example: Any, count: int, seed: int) -> Any:
+    if example.states is not None:
+        return example.states(count, seed)
+    return models.c_states(example.model, example.substeps, count, seed)
+
+
 def _errors(models: Any, kernel: Any, example: Any, own: Any) -> dict[str, float]:
     """How far one control step of the kernel is from C MuJoCo's own, with contacts and without."""
     model, substeps = example.model, example.substeps
-    states = models.c_states(model, substeps, STATES)
+    states = _states(models, example, STATES, 0)
     ctrl = models.random_ctrl(model, STATES, np.random.default_rng(0))
     ours, theirs = kernel(states, ctrl), models.c_step(own, substeps, states, ctrl)
     moved = models.c_step(own, substeps, models.one_ulp(states), ctrl)
@@ -237,27 +265,30 @@ def add(row: Mapping[str, Any], to: Path) -> None:
 
 def table(of: Path) -> str:
     """The table of the guide."""
+    rows_of = pd.read_csv(of)
+    sides = [side for side in SIDES[1:] if f"times_{side}" in rows_of]
     head = (
-        "| model, cores | degrees, constraints | simd, control steps/s | / C, same settings | / C, its own | / xla | "
+        "| model, cores | degrees, constraints | simd, control steps/s | "
+        f"{' | '.join(BESIDE[side] for side in sides)} | "
         "from C's own: contact, median; 99 %; greatest | no contact, 99 %; C after one ulp, 99 % | "
         "operations, code | compiled in (of the processor) |"
     )
-    lines = [head, "|" + " --- |" * 10]
+    lines = [head, "|" + " --- |" * (7 + len(sides))]
 
     def times(row: Any, side: str) -> str:
         if np.isnan(row.get(f"times_{side}", np.nan)):
             return "-"
         return "{:.1f} ({:.1f} to {:.1f})".format(*(row[f"{part}_{side}"] for part in ("times", "least", "most")))
 
-    for row in pd.read_csv(of).to_dict("records"):
+    for row in rows_of.to_dict("records"):
         name = f"{row['row']}{', all pairs' if row['all_pairs'] else ''}, {row['cores']}"
         if np.isnan(row["simd"]):
-            lines.append(f"| {name} | {row['note']} |" + " |" * 8)
+            lines.append(f"| {name} | {row['note']} |" + " |" * (5 + len(sides)))
             continue
         error = {key: "-" if np.isnan(row.get(key, np.nan)) else f"{row[key]:.1e}" for key in ERRORS}
         cells = [
             name, f"{row['nv']:.0f}, {row['constraints']:.0f}", f"{row['simd']:,.0f}",
-            *(times(row, side) for side in SIDES[1:]),
+            *(times(row, side) for side in sides),
             "; ".join(error[key] for key in ERRORS[:3]), "; ".join(error[key] for key in ERRORS[3:]),
             f"{row['operations']:,.0f}, {row['code_kb']:.0f} kB", f"{row['cold_s']:.0f} s ({row['cold_cpu_s']:.0f})",
         ]  # fmt: skip
