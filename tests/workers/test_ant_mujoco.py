@@ -5,6 +5,7 @@ A state that moves by one float32 ulp shows how exact a comparison can be: C MuJ
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from typing import Any
 
@@ -25,6 +26,7 @@ from workers.environments import (
     make_host_task,
 )
 from workers.environments.ant_mujoco import MujocoAntState
+from workers.environments.ant_tasks import STEP_S
 from workers.environments.host_task import HostEnvironment
 from workers.environments.mujoco_parts import contacts_as_c, mjx, mujoco, put_model
 from workers.environments.wall_boxes import SLOTS, wall_contacts
@@ -32,9 +34,14 @@ from workers.viewer import scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")
 TASKS = ("ant_maze", "ant_trap")
-TIMES = 8.0
-"""Errors may be so many times as great as what one ulp of a state makes in C MuJoCo: a step rounds thousands of
-times."""
+TIMES = 2.0
+"""99 % of errors are at most so many times as great as what one ulp of a state makes in C MuJoCo, before the step or
+after it."""
+GREATEST = {"observation": 8.0, "reward": 80.0}
+"""The greatest error of 1,000 is at most so many times as great. In a few states in contact, MJX's solver ends with
+accelerations that no last bit of the state explains, because it computes in float32; in double precision MJX is within
+1e-6 (`test_in_double_precision_a_control_step_is_that_of_c_mujoco`). A reward divides what they move the ant by the
+seconds of a step."""
 
 
 def poses_in_walls(task: str, count: int) -> np.ndarray:
@@ -104,8 +111,9 @@ def test_contacts_with_walls_are_those_of_c_mujoco(task: str):
 @pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 def test_a_control_step_is_that_of_c_mujoco(task: str):
-    """Of 1,000 states: 99 % of errors are at most TIMES the greatest that one ulp makes in C MuJoCo, with its unit
-    1e-6."""
+    """Of 1,000 states: 99 % of errors are at most TIMES, and all at most GREATEST times as great as the greatest that
+    one ulp makes in C MuJoCo, with its unit 1e-6. The reward of AntTrap is a difference of two places, and the second
+    is rounded to float32, too."""
     given, rng = ants.states(task, 1000), np.random.default_rng(1)
     (truth, touches), found, moved = ants.steps_in_c(task, given), ants.steps_by_simd(task, given), []
     for _ in range(4):
@@ -113,6 +121,9 @@ def test_a_control_step_is_that_of_c_mujoco(task: str):
             np.nextafter(x, np.where(rng.random(x.shape) < 0.5, -9e9, 9e9).astype(x.dtype)) for x in given[:2]
         )
         moved.append(ants.steps_in_c(task, ants.Given(qpos, qvel, given.action))[0])
+    if task == "ant_trap":
+        ulp = np.spacing(np.abs(given.qpos[:, 0])) / STEP_S
+        moved.append(truth._replace(reward=truth.reward + ulp))
     print(f"\n{task}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more")
     assert (touches > 0).mean() > 0.1
     for what in ("observation", "reward"):
@@ -121,8 +132,41 @@ def test_a_control_step_is_that_of_c_mujoco(task: str):
         ulp = np.maximum.reduce(ulps)
         print(what, *(f"{np.quantile(of, share):.1e}" for of in (error, ulp) for share in (0.5, 0.99, 1.0)))
         assert np.quantile(error, 0.99) <= TIMES * (ulp.max() + 1e-6), what
+        assert error.max() <= GREATEST[what] * (ulp.max() + 1e-6), what
     at_the_edge = np.any([of.done != truth.done for of in moved], axis=0)
     np.testing.assert_array_equal(found.done[~at_the_edge], truth.done[~at_the_edge])
+
+
+DOUBLE = """
+import sys, jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from tests import mujoco_ants as ants
+from tests.mujoco_models import relative_error
+from workers.environments import mujoco_parts
+task, given = sys.argv[1], ants.states(sys.argv[1], 200)
+example, (truth, touches) = ants.example(task), ants.steps_in_c(task, given)
+mx = mujoco_parts.put_model(example.of_mjx)
+def step(*of):
+    state, look = mujoco_parts.start(mx, *of[:2]), lambda data: ()
+    after, _ = mujoco_parts.step_and_look(mx, state, of[2], example.substeps, look, contacts=example.contacts)
+    return jax.numpy.concatenate([after.qpos[2:], after.qvel])
+found = np.asarray(jax.jit(jax.vmap(step))(*(x.astype(float) for x in given)))
+error = relative_error(found, truth.observation[:, 2:29].astype(float))
+print(found.dtype, (touches > 0).sum(), np.quantile(error, 0.5), error.max())
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("task", TASKS)
+def test_in_double_precision_a_control_step_is_that_of_c_mujoco(task: str):
+    """Of all of 200 states, to the float32 of C's observations: what is further away in float32 is rounding."""
+    command = [sys.executable, "-c", DOUBLE, task]
+    child = subprocess.run(command, capture_output=True, text=True, check=True, timeout=1200)
+    dtype, touches, median, most = child.stdout.split()[-4:]
+    assert dtype == "float64"
+    assert int(touches) > 20
+    assert float(median) < 1e-7
+    assert float(most) < 1e-6
 
 
 @pytest.mark.slow
