@@ -57,6 +57,11 @@ class Tail:
         self._at = size
         return printable(os.pread(self._file, size - first, first))
 
+    def skip(self) -> None:
+        """Leave out what was written until now."""
+        if self._file >= 0:
+            self._at = os.fstat(self._file).st_size
+
     def close(self) -> None:
         """Read nothing any more."""
         if self._file >= 0:

@@ -190,7 +190,7 @@ def task_findings(name: str) -> Iterator[Finding]:
     answers = [examined(name, {}, SECONDS) for _ in range(1 if task.kind == "jax" else 2)]
     for answer in answers:
         if problem := answer.get("problem"):
-            yield "FAIL", f"{name}: {problem}"
+            yield "FAIL", f"{name}: {problem}" + (_what_was_tried(task) if answer.get("is_lost") else "")
             return
         if fault := answer["fault"]:
             yield "FAIL", f"{name}: an episode of a random policy is invalid {fault}"
@@ -214,6 +214,13 @@ def task_findings(name: str) -> Iterator[Finding]:
     unit = "calls" if task.kind == "function" else "steps"
     rate, memory = max(result["steps_per_second"] for result in (first, second)), first["peak_mib"]
     yield "ok", f"{rate:,.0f} {unit}/s on one core without a policy; its process takes {memory:,} MiB"
+
+
+def _what_was_tried(task: TaskSpec) -> str:
+    """With what a task was tried whose process has ended, so that a user can try it alone."""
+    if task.parameters is None:
+        return "\nThe resets of its first episodes have the seeds 1 and 2, and their actions are random"
+    return f"\nIts calls have {task.parameters.text(task.parameters.first(0, 0))}, with the seeds 1 and 2"
 
 
 def _with_new_objects(name: str) -> Iterator[Finding]:

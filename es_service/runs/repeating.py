@@ -30,7 +30,7 @@ def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str
     except RaisedError as error:
         return {"problem": error.message}
     except NoAnswerError as error:
-        return {"problem": f"it could not be examined: its process {error}"}
+        return {"problem": f"it could not be examined: its process {error}", "is_lost": True}
 
 
 def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:

@@ -100,6 +100,14 @@ def test_tasks_that_do_not_repeat_are_told_from_one_that_does_with_what_mends_it
     assert any("it repeats bit for bit" in text for _, text in said)
 
 
+def test_a_function_that_ends_its_process_is_named_with_its_parameters_and_what_it_has_printed():
+    *_, (level, failure) = findings("function:tests.workers.functions:doomed")
+    assert level == "FAIL"
+    assert re.search(
+        r"its process ended with exit code 3:\nsingular matrix\n.* width = 0\.5, with the seeds 1 and 2", failure
+    )
+
+
 def test_tasks_in_jax_repeat_and_what_is_no_task_is_named():
     assert findings("point_maze")[-1][1].startswith("its steps are pure functions")
     with pytest.raises(ConfigError, match=r"point_mase is not a known task; .*did you mean point_maze\?"):

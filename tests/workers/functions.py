@@ -114,6 +114,15 @@ def deadly(parameters):
 deadly.parameters = ("left", "right")
 
 
+def doomed(parameters):
+    """A function that always ends its process."""
+    os.write(2, b"singular matrix\n")
+    os._exit(3)
+
+
+doomed.parameters = {"width": (0.0, 1.0)}
+
+
 def slow(parameters):
     """It hangs, or ends its process, once: where a file says so, and the first parameter is positive."""
     fault = Path(os.environ["HOST_FAULT"])
@@ -121,6 +130,7 @@ def slow(parameters):
     if kind and parameters[0] > 0.05:  # a member and no centre
         fault.unlink(missing_ok=True)
         if kind == "exit":
+            os.write(2, b"no licence is left\n")
             os._exit(3)
         time.sleep(1000.0)
     return float(parameters.sum())

@@ -247,7 +247,7 @@ def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(ki
     run = api.run(config, tmp_path / "run", on_notice=notices.append).run
     why = {
         "hang": r"its process gave no answer within 1 s \(task.time_limit_s\)",
-        "exit": "its process ended with exit code 3",
+        "exit": "its process ended with exit code 3; it has printed: no licence is left",
     }
     assert re.search(rf"member [+-] of pair \d with x0 = .*, x2 = \S+ \(seed \d+\): {why[kind]}", *notices)
     assert run.history[["lost_workers", "retries"]].to_numpy().sum() == 0

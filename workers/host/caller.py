@@ -17,7 +17,10 @@ from es_service.protocol.process_environment import same_imports
 from es_service.protocol.raised import RaisedError
 from workers.environments import make_function_task
 from workers.environments.function_task import FunctionTask
+from workers.reports import Tail
 
+PRINTED_BYTES = 500
+"""At most this many bytes of what a call has printed are told if it ends its process, or takes too long."""
 START_S = 120.0
 """Longest time in which the process of a function must have imported it."""
 
@@ -39,6 +42,7 @@ class Caller:
         """The function as this process has it, for what is known without a call."""
         self._given, self._limit_s = (name, dict(options)), limit_s
         self._child: Child | None = None
+        self._printed = Tail(2)
 
     def start(self) -> None:
         """Start the process if there is none. Raises CallFailedError if the function cannot be imported there."""
@@ -63,10 +67,13 @@ class Caller:
 
     def _answer(self, request: tuple[Any, ...], limit_s: float, key: str = "") -> Any:
         assert self._child is not None, "the process has been started"
+        self._printed.skip()
         try:
             return self._child.call(*request, limit_s=limit_s)
         except NoAnswerError as error:
-            raise CallFailedError(f"its process {error}{key if error.is_late else ''}") from None
+            printed = self._printed.new(PRINTED_BYTES)
+            said = f"; it has printed: {' / '.join(printed.splitlines())}" if printed else ""
+            raise CallFailedError(f"its process {error}{key if error.is_late else ''}{said}") from None
         except RaisedError as error:
             raise CallFailedError(error.message) from None
 
