@@ -20,9 +20,9 @@ SIZE = 5
 DOINGS = ("", "making", "resetting")
 """Values of DOING, in words."""
 
-Row = MutableSequence[int] | memoryview
-_own: Row = [0] * SIZE
-_rows: list[Row] = [_own]
+Counters = MutableSequence[int] | memoryview
+_own: Counters = [0] * SIZE
+_rows: list[Counters] = [_own]
 _numbers = count(1)
 _running: dict[int, None] = {}
 """Calls that the cores of this worker compute, oldest first."""

@@ -36,7 +36,7 @@ TOUCH = 0.005
 """Distance from the floor, in metres, below which a foot counts as touching it."""
 
 
-class _State(NamedTuple):
+class _BraxState(NamedTuple):
     """State of a Brax environment and of the descriptor `feet_contact`."""
 
     brax: Any
@@ -87,21 +87,21 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
     feet = _feet(system) if descriptor == "feet_contact" else []
     root = _root_coordinates(system)
 
-    def reset(key: Any) -> _State:
+    def reset(key: Any) -> _BraxState:
         with quietly():
             state = environment.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32"))
         state = jax.tree.map(jnp.asarray, state)
-        return _State(state, jnp.zeros(len(feet), jnp.float32), jnp.float32(0.0))
+        return _BraxState(state, jnp.zeros(len(feet), jnp.float32), jnp.float32(0.0))
 
-    def step(state: _State, action: Any) -> tuple[_State, Any, Any]:
+    def step(state: _BraxState, action: Any) -> tuple[_BraxState, Any, Any]:
         own = jax.tree.map(lambda x: x, state.brax)  # a copy, because Brax writes into the metrics of its argument
         with quietly():
             after = environment.step(own, jnp.clip(action, -1.0, 1.0))
         after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state.brax)
         touched_F = state.touched_F + _touching(system, after.pipeline_state.x, feet)
-        return _State(after, touched_F, state.steps + 1.0), after.reward, after.done > 0.5
+        return _BraxState(after, touched_F, state.steps + 1.0), after.reward, after.done > 0.5
 
-    def describe_state(state: _State) -> Any:
+    def describe_state(state: _BraxState) -> Any:
         physics = state.brax.pipeline_state
         match descriptor:
             case "final_xy":

@@ -103,7 +103,7 @@ class Actuators:
         return low + half * (jnp.clip(action_A, -1.0, 1.0).reshape(low.shape) + 1.0)
 
 
-class _State(NamedTuple):
+class _SuiteState(NamedTuple):
     suite: Any
     observation_O: Any
     key: Any
@@ -175,12 +175,12 @@ def make_suite(suite: Suite, descriptor: Any = None) -> Environment:
         leaves = [jnp.asarray(leaf).astype(jnp.float32).reshape(-1) for leaf in jax.tree.leaves(observation)]
         return jnp.concatenate(leaves)
 
-    def reset_as_it_is(key: Any) -> _State:
+    def reset_as_it_is(key: Any) -> _SuiteState:
         with quietly():
             state, observation = suite.reset(jax.random.fold_in(key[:2], 0))
-        return _State(state, flat(observation), key[:2], jnp.int32(0))
+        return _SuiteState(state, flat(observation), key[:2], jnp.int32(0))
 
-    def step_as_it_is(state: _State, action_A: Any) -> tuple[_State, Any, Any]:
+    def step_as_it_is(state: _SuiteState, action_A: Any) -> tuple[_SuiteState, Any, Any]:
         allowed_A = True if suite.mask is None else suite.mask(state.suite)
         number = state.step + 1
         with quietly():
@@ -188,20 +188,20 @@ def make_suite(suite: Suite, descriptor: Any = None) -> Environment:
                 jax.random.fold_in(state.key, number), state.suite, suite.actions.of(action_A, allowed_A)
             )
         reward = jnp.asarray(reward, jnp.float32).reshape(())
-        return _State(after, flat(observation), state.key, number), reward, jnp.asarray(done, bool).reshape(())
+        return _SuiteState(after, flat(observation), state.key, number), reward, jnp.asarray(done, bool).reshape(())
 
     first = jax.eval_shape(reset_as_it_is, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
     stepped = jax.eval_shape(step_as_it_is, first, jax.ShapeDtypeStruct((suite.actions.size,), jnp.float32))[0]
     indices = np.array(_indices(descriptor, first.observation_O.shape[0]), np.int32)
 
-    def described(state: _State) -> Any:
+    def described(state: _SuiteState) -> Any:
         return state.observation_O[indices] if indices.size else state.step[None].astype(jnp.float32)
 
-    def settled(state: _State) -> _State:
+    def settled(state: _SuiteState) -> _SuiteState:
         """A state with the dtypes that steps give, since resets write numbers such as 0 without one."""
         return jax.tree.map(lambda leaf, like: jnp.asarray(leaf).astype(like.dtype), state, stepped)
 
-    def step(state: _State, action_A: Any) -> tuple[_State, Any, Any]:
+    def step(state: _SuiteState, action_A: Any) -> tuple[_SuiteState, Any, Any]:
         after, reward, done = step_as_it_is(state, action_A)
         return settled(after), reward, done
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.process_environment import on_gpu
-from workers.rollouts.asked import Asked
+from workers.rollouts.asked import AskedRollout
 from workers.rollouts.backend import RolloutBackend
 from workers.rollouts.host import Host
 from workers.rollouts.simd import Simd
 from workers.rollouts.xla import Xla
 
-BACKENDS: dict[str, RolloutBackend] = {rollout.name: rollout for rollout in (Asked(), Host(), Xla(), Simd())}
+BACKENDS: dict[str, RolloutBackend] = {rollout.name: rollout for rollout in (AskedRollout(), Host(), Xla(), Simd())}
 """Name, as in `compute.rollout` -> rollout, from the slowest to the fastest. `protocol.rollouts.choose` is what `auto`
 means."""
 

@@ -12,7 +12,7 @@ from workers.environments import TaskError
 from workers.rollouts.backend import ChunkFunctions, RolloutBackend
 
 
-class Asked(RolloutBackend):
+class AskedRollout(RolloutBackend):
     """Chunks have all pairs, since nothing is distributed."""
 
     name = "asked"

@@ -99,13 +99,13 @@ def primitive(*names: str) -> Callable[[PrimitiveRule], PrimitiveRule]:
     return enter
 
 
-class Place(NamedTuple):
+class EquationPlace(NamedTuple):
     source: source_info_util.SourceInfo
-    outer: Place | None
+    outer: EquationPlace | None
     """The equation whose function contains it."""
 
 
-def line_of(place: Place | None) -> str:
+def line_of(place: EquationPlace | None) -> str:
     """The innermost line of the user's files, as "file:line (function)"; without one, that of a library."""
     sources = []
     while place is not None:
@@ -144,7 +144,7 @@ class Tracer:
 
         outer = self.graph.place
         for equation in jaxpr.eqns:
-            self.graph.place = Place(equation.source_info, outer)
+            self.graph.place = EquationPlace(equation.source_info, outer)
             rule = PRIMITIVES.get(equation.primitive.name)
             try:
                 if rule is None:
