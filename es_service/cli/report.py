@@ -64,6 +64,10 @@ def report(
         list[str] | None,
         typer.Option("--label", metavar="GROUP=TEXT", help="Show a group under another name; can be repeated."),
     ] = None,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option("--metric", metavar="NAME", help="Column of --figures and --statistics; can be repeated."),
+    ] = None,
     statistics: Annotated[
         Path | None,
         typer.Option(
@@ -82,7 +86,9 @@ def report(
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")
         if out is None and len(folders) > 1:
             raise ConfigError("a comparison of runs belongs to none of their folders; add --out FILE")
-        how = _How(group_by or (), threshold, figures, paired, statistics, bounds_of(bounds or ()), label or ())
+        how = _How(
+            group_by or (), threshold, figures, paired, statistics, bounds_of(bounds or ()), label or (), metric or ()
+        )
         _compare(folders, out or folders[0] / REPORT, how)
         return
     if group_by or threshold is not None or paired or statistics:
@@ -130,6 +136,7 @@ class _How(NamedTuple):
     statistics: Path | None
     bounds: dict[str, tuple[float, float]]
     labels: Sequence[str]
+    metrics: Sequence[str]
 
 
 def _compare(folders: Sequence[Path], out: Path, how: _How) -> None:
@@ -151,8 +158,8 @@ def _compare(folders: Sequence[Path], out: Path, how: _How) -> None:
         group_by = swept_keys(runs)
     if how.labels:
         runs, group_by = labelled(runs, group_by, dict(_pair(word) for word in how.labels)), GROUP
-    given = {"paired": how.paired, "statistics": how.statistics}
-    for file in write_comparison(runs, out, group_by, how.threshold, how.figures, **given):
+    given = runs, out, group_by, how.threshold, how.figures
+    for file in write_comparison(*given, paired=how.paired, statistics=how.statistics, metrics=how.metrics):
         print(file)
     if problems:
         raise typer.Exit(1)

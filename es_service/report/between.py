@@ -25,7 +25,7 @@ from es_service.report.compare import Group, runs_of
 from es_service.report.data import RunData
 from es_service.report.facts import number
 from es_service.report.markup import Markup, table, tag
-from es_service.report.measures import Measure, measures
+from es_service.report.measures import Measure, chosen
 from es_service.report.page import section
 from es_service.report.statistics import Difference
 
@@ -73,12 +73,19 @@ class Compared(NamedTuple):
         return min(1.0, len(self.pairs) * min(pair.difference.smallest_p for pair in self.pairs))
 
 
-def compared(groups: Sequence[Group], threshold: float | None = None, *, paired: bool = False) -> list[Compared]:
+def compared(
+    groups: Sequence[Group],
+    threshold: float | None = None,
+    *,
+    paired: bool = False,
+    metrics: Sequence[str] = (),
+) -> list[Compared]:
     """All measures that all runs have, between each two groups.
 
     Args:
         threshold: fitness of which the cost to reach it is compared; None: it is not.
         paired: whether runs with equal seeds belong together; otherwise all are independent.
+        metrics: names of measures; none: all, and the cost.
 
     Raises:
         ConfigError: groups are paired that have not the same seeds, once each.
@@ -86,7 +93,7 @@ def compared(groups: Sequence[Group], threshold: float | None = None, *, paired:
     if paired:
         _require_pairs(groups)
     found = []
-    for name, (measure, value) in _measures(groups, threshold).items():
+    for name, (measure, value) in _measures(groups, threshold, metrics).items():
         values_R = _values(groups, value)
         if any(np.isnan(np.concatenate(of_group)).any() for of_group in values_R):
             continue
@@ -126,7 +133,7 @@ def _values(groups: Sequence[Group], value: Callable[[RunData], float]) -> list[
 
 
 def _measures(
-    groups: Sequence[Group], threshold: float | None
+    groups: Sequence[Group], threshold: float | None, metrics: Sequence[str] = ()
 ) -> dict[str, tuple[Measure, Callable[[RunData], float]]]:
     """Name -> (what is said of a measure, its number of a run; NaN if there is none)."""
 
@@ -134,8 +141,8 @@ def _measures(
         reached = np.flatnonzero(run.history["best_fitness"] >= (np.inf if threshold is None else threshold))
         return float(run.history["env_steps"][reached[0]]) if reached.size else np.inf
 
-    found = {name: (measure, _last(name)) for name, measure in measures(runs_of(groups)).items()}
-    if threshold is not None:
+    found = {name: (measure, _last(name)) for name, measure in chosen(runs_of(groups), metrics).items()}
+    if threshold is not None and not metrics:
         label = f"environment steps until a best fitness of {number(threshold)}"
         found[COST] = (Measure(label, label, "", less_is_better=True), cost)
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
-from es_service.report.measures import GAP, measures
+from es_service.report.measures import GAP, chosen
 from es_service.report.overview import draw_overview
 from es_service.report.several_maps import over_seeds
 
@@ -23,7 +24,9 @@ COLUMN, PAGE = 3.4, 7.0
 """Width of a figure in inches: in a column, and over both columns of a page."""
 SIZE = (COLUMN, 2.6)
 """Width and height of a figure in inches, unless it has several panels."""
-PANELS_IN_A_ROW = 4
+PANELS_IN_A_ROW, SMALL_PANELS_IN_A_ROW = 4, 7
+FEW = 8
+"""With more groups, their maps are small."""
 STYLE = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7, "lines.linewidth": 1.2, "pdf.fonttype": 42}
 """Sizes of text as in a paper; text in a PDF stays text."""
 
@@ -39,20 +42,27 @@ def empty_figure() -> Any:
 
 
 def write_figures(
-    runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (), threshold: float | None = None
+    runs: Sequence[RunData],
+    folder: Path,
+    keys: Sequence[str] = (),
+    threshold: float | None = None,
+    metrics: Sequence[str] = (),
 ) -> list[Path]:
     """Write all figures of one run, or of the comparison of several; return the files.
 
     Args:
         keys: config keys that group the runs.
         threshold: fitness from which a run of a comparison counts as solved; see `draw_overview`.
+        metrics: columns of which curves and profiles are drawn; none: curves of all of `measures`, and a profile of the
+            value by which runs are judged.
 
     Raises:
-        ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
+        ConfigError: matplotlib is missing, the runs cannot be compared, or one lacks a metric. StoreError: the folder
+            cannot be written.
     """
     drawings: dict[str, Callable[[Any], Any]] = {}
-    for column in measures(runs):
-        if column != GAP:
+    for column in chosen(runs, metrics):
+        if column != GAP or metrics:
             drawings[column] = lambda figure, column=column: plots.curves(
                 list(runs), figure.subplots(), column, group_by=keys
             )
@@ -69,7 +79,10 @@ def write_figures(
     else:
         if len({run.constants["task.environment"] for run in runs}) == 1:
             drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
-        drawings["profile"] = lambda figure: plots.profile(list(runs), figure.subplots(), group_by=keys)
+        for column in metrics or [compare.value_column(runs)]:
+            drawings[f"profile_{column}" if metrics else "profile"] = lambda figure, column=column: plots.profile(
+                list(runs), figure.subplots(), column, keys
+            )
         groups = compare.grouped(runs, keys)
         if len(mapped) == len(runs):
             drawings["behaviour_maps"] = lambda figure: _grid(figure, [
@@ -89,7 +102,8 @@ def write_figures(
                 figure = empty_figure()
                 draw(figure)
                 for kind in KINDS:
-                    written.append(folder / f"{name}.{kind}")
+                    # A column may be named after a task of a stranger's run, and no name from there is a path.
+                    written.append(folder / f"{re.sub(r'[^a-zA-Z0-9]+', '_', name)}.{kind}")
                     figure.savefig(written[-1], dpi=DPI)
     except OSError as error:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
@@ -106,16 +120,17 @@ def _grid(
     """Maps with their titles in rows, all with the same colours, and one bar of colours."""
     maps = [run.map for _, run in shown if run.map is not None]
     colours = colours or value_range(np.concatenate([map_.fitness_N for map_ in maps]))
-    across = min(PANELS_IN_A_ROW, len(shown))
+    in_a_row = PANELS_IN_A_ROW if len(shown) <= FEW else SMALL_PANELS_IN_A_ROW
+    across, panel = min(in_a_row, len(shown)), PAGE / in_a_row
     rows = -(-len(shown) // across)
-    panel = PAGE / PANELS_IN_A_ROW
     figure.set_size_inches(max(COLUMN, across * panel), rows * (panel + 0.25))
     figure.set_layout_engine("constrained")
     panels, drawn = figure.subplots(rows, across, squeeze=False).ravel(), None
     for axes, (name, run) in zip(panels, shown, strict=False):
         drawn = plots.behaviour_map(run, axes, colours)
         axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        axes.set_title(name, parse_math=False)  # a name may contain a $
+        # A name may contain a $.
+        axes.set_title(name, parse_math=False, fontsize=8 if len(shown) <= FEW else 5, wrap=True)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     figure.colorbar(drawn, ax=panels, label=label, aspect=30, fraction=0.03, pad=0.02)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.text import did_you_mean, nearest
+from es_service.errors import ConfigError
 from es_service.loop.history import CORRECTED, METRIC
 from es_service.report.series import Columns
 from es_service.runs.certified import measure_of
@@ -91,6 +93,21 @@ def measures(runs: Sequence[RunData]) -> dict[str, Measure]:
     elsewhere, own = ([column for column in runs[0].history if column.startswith(one)] for one in (ELSEWHERE, METRIC))
     names = [CERTIFIED, SUCCESS, *elsewhere, *(name for name in MEASURES if name not in (CERTIFIED, SUCCESS)), *own]
     return {name: measure_named(name) for name in names if all(has_values(run, name) for run in runs)}
+
+
+def chosen(runs: Sequence[RunData], names: Sequence[str]) -> dict[str, Measure]:
+    """What `measures` returns, or some of it. Raises ConfigError for one that a run lacks."""
+    found = measures(runs)
+    for name in names:
+        if name not in found:
+            raise ConfigError(
+                f"{name} is no measure that all runs have{did_you_mean(name, found)}; they have {', '.join(found)}",
+                field="metrics",
+                value=name,
+                allowed=", ".join(found),
+                suggestion=nearest(name, found),
+            )
+    return {name: found[name] for name in names} or found
 
 
 def has_values(run: RunData, column: str) -> bool:

@@ -92,6 +92,7 @@ def write_comparison(
     paired: bool = False,
     statistics: AnyPath | None = None,
     bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    metrics: Sequence[str] = (),
 ) -> list[Path]:
     """Write the page that compares runs and return the files written, the page first.
 
@@ -105,6 +106,7 @@ def write_comparison(
             .tex); None: none is written.
         bounds: task -> fitness that counts as 0 and as 1; with them, runs of several tasks can be compared, of which
             each group must have all.
+        metrics: columns of the figures and of the file of statistics; none: all that all runs have.
 
     Raises:
         ConfigError: the runs cannot be compared, grouped or paired, the file of statistics has another ending, or
@@ -121,11 +123,11 @@ def write_comparison(
     if statistics is not None:
         groups = compare.grouped(different, group_by)
         limit = compare.common_threshold(different) if threshold is None else threshold
-        text = between.text_of(between.compared(groups, limit, paired=paired), kind)
+        text = between.text_of(between.compared(groups, limit, paired=paired, metrics=metrics), kind)
         written.append(write_page(text, given_path(statistics)))
     return [
         *written,
-        *(write_figures(different, given_path(figures), group_by, threshold) if figures is not None else []),
+        *(write_figures(different, given_path(figures), group_by, threshold, metrics) if figures is not None else []),
     ]
 
 

@@ -265,6 +265,19 @@ def test_figures_are_written_as_svg_pdf_and_png(folders, runs, tmp_path):
     assert names <= {file.name for file in several}
 
 
+@pytest.mark.slow
+def test_figures_of_chosen_metrics_have_names_that_are_no_paths(runs, tmp_path):
+    name = "certified in ../../x:Ant"
+    named = [replace(run, history={**run.history, name: run.history["best_fitness"]}) for run in runs]
+    files = write_figures(named, tmp_path / "in" / "figures", metrics=[name, "coverage"])
+    assert {file.parent for file in files} == {tmp_path / "in" / "figures"}
+    names = {file.stem for file in files}
+    assert {"certified_in_x_Ant", "coverage", "profile_certified_in_x_Ant", "profile_coverage"} <= names
+    assert "best_fitness" not in names
+    with pytest.raises(ConfigError, match="coverge is no measure that all runs have; did you mean coverage"):
+        write_figures(runs, tmp_path / "figures", metrics=["coverge"])
+
+
 def map_of(run: RunData) -> BehaviourMap:
     assert run.map is not None
     return run.map
