@@ -9,6 +9,7 @@ import os
 import pickle
 import socket
 from contextlib import suppress
+from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:  # they import JAX, whose settings are made here
     from workers.compilable import Compilable
     from workers.parents import Parents
     from workers.reports import Reports
+
+KEPT_LOGS = 16
+"""Ended workers of a job whose output stays on a node."""
 
 
 class WorkerActor:
@@ -75,6 +79,8 @@ class WorkerActor:
         for descriptor in (1, 2):  # Ray has a file for each of the two
             with suppress(OSError):  # a Ray that takes the output through a pipe has limits of its own
                 newest_output().add(descriptor, spec.output_bytes // 2)
+        with suppress(OSError):
+            remove_old_logs(Path(os.readlink("/proc/self/fd/1")))
         if problem := why_refused(spec.sources, spec.task_code, spec.platform):
             raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)
@@ -131,3 +137,22 @@ class WorkerActor:
             if isinstance(part, dict):
                 self._parents.receive(part)
         return self._parents.complete([(known[index], chunk) for index, chunk in indexed])
+
+
+def remove_old_logs(own: Path) -> None:
+    """Remove what ended workers of the same job have printed on this node, but for the last KEPT_LOGS of them.
+
+    Ray never does, and a run whose workers are replaced may go on for weeks.
+
+    Args:
+        own: the file with what this worker prints, named by Ray `worker-WORKER-JOB-PROCESS.out`.
+    """
+    *_, job, _ = own.stem.split("-")
+    logs = [
+        log
+        for log in own.parent.glob(f"worker-*-{job}-*.out")
+        if not Path("/proc", log.stem.rpartition("-")[2]).exists()
+    ]
+    for log in sorted(logs, key=lambda log: log.stat().st_mtime)[:-KEPT_LOGS]:
+        for file in (log, log.with_suffix(".err")):
+            file.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from es_service.runs.reports import reader_of_reports
 from es_service.store.lock import MOST_LINE, MOST_LINES, acquire_lock, last_output, lock_holder
 from tests.helpers import spec
 from workers import reports
+from workers.actor import KEPT_LOGS, remove_old_logs
 from workers.reports import Reports, Tail, printable, require_room
 
 MIB = 2**20
@@ -103,3 +104,17 @@ def test_the_newest_lines_are_read_by_others_and_the_first_replacement_is_a_noti
     assert last_output(tmp_path) == tuple([f"worker 4: {'é' * 1000}"[:MOST_LINE]] * MOST_LINES)
     (notice,) = notices
     assert notice.startswith("worker 4 is replaced by a new process, since it leaks. Later replacements are in the log")
+
+
+def test_of_the_output_of_ended_workers_of_a_job_the_newest_files_stay(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    names = [f"worker-{number:02}-01000000-{ended.pid}" for number in range(KEPT_LOGS + 3)]
+    others = [f"worker-aa-02000000-{ended.pid}", f"worker-bb-01000000-{os.getpid()}"]
+    for number, name in enumerate([*others, *names]):
+        for kind in ("out", "err"):
+            (tmp_path / f"{name}.{kind}").touch()
+            os.utime(tmp_path / f"{name}.{kind}", (number, number))
+    remove_old_logs(tmp_path / f"{others[1]}.out")
+    left = {file.name for file in tmp_path.iterdir()}
+    assert left == {f"{name}.{kind}" for name in [*others, *names[3:]] for kind in ("out", "err")}
