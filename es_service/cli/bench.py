@@ -14,7 +14,7 @@ from es_service.cli.printing import print_json_line
 from es_service.config.given import Overrides, parse_overrides
 from es_service.config.parts import TASK_OPTIONS
 from es_service.config.resolution import options_of
-from es_service.config.tasks import CALLER, ROLLOUTS, TASKS, read_options
+from es_service.config.tasks import CALLER, OTHER_TASKS, ROLLOUTS, TASKS, read_options
 from es_service.config.text import did_you_mean_task, one_of, problem_of
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
@@ -55,8 +55,7 @@ def bench_rollouts(
     for task in tasks:
         if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, mujoco:ID, gymnasium:ID, "
-                f"python:module:Class, function:module:name, or module:Class"
+                f"--task {task}: unknown task; must be {one_of(TASKS)}, or {OTHER_TASKS}"
                 f"{did_you_mean_task(task, TASKS)}"
             )
     options = {task: _options(task, overrides) for task in tasks or TASKS}

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from es_service.config.keys import GROUPS, SECTIONS, not_a_mapping
+from es_service.config.keys import GROUPS, not_a_mapping
 from es_service.config.text import did_you_mean, in_line, nearest, parse_value, plain, problem_of, read_yaml_file
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.system import given_path
@@ -97,18 +97,6 @@ def by_key(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any],
         else:
             values[name] = plain(value)
     return values, unusable, problems
-
-
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings from dotted keys, the inverse of `flat`; every section is present, even if empty."""
-    sections: dict[str, Any] = {section: {} for section in SECTIONS}
-    for name, value in values.items():
-        *path, leaf = name.split(".")
-        target = sections
-        for group in path:
-            target = target.setdefault(group, {})
-        target[leaf] = value
-    return sections
 
 
 def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]]:

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from es_service.config.given import Overrides, Source, by_key, nested, parse_overrides, read_config
+from es_service.config.given import Overrides, Source, by_key, parse_overrides, read_config
 from es_service.config.keys import (
     FIELDS,
     KIND,
+    SECTIONS,
     Methods,
     all_search_fields,
     has_effect,
@@ -28,14 +29,14 @@ from es_service.config.keys import (
     parts_of,
     search_fields,
 )
-from es_service.config.model import Kept, Made, RunConfig, replaces
+from es_service.config.model import Kept, Made, RunConfig, nested, replaces
 from es_service.config.parts import TASK_OPTIONS, as_tuple
 from es_service.config.resolution import Unknown, Values, asks
 from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of
 from es_service.config.search import SearchConfig, preset_rows
-from es_service.config.tasks import CHOICES, Tasks, read_options, settings_of_task
+from es_service.config.tasks import CHOICES, OTHER_TASKS, Tasks, read_options, settings_of_task
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
-from es_service.config.values import allowed_words, value_problems
+from es_service.config.values import allowed_words, validator_problems, value_problems
 from es_service.errors import ConfigError, Problem, counted
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.rollouts import Rollouts
@@ -86,9 +87,9 @@ class Reading:
         if isinstance(start := values["search.init_from"], str):
             # An absolute path, so that the stored config names the same run from every working directory.
             values["search.init_from"] = given["search.init_from"] = os.path.abspath(given_path(start))
-        sections = nested(values)
+        sections = nested(values, SECTIONS)
         config = RunConfig.model_validate(sections | {"search": self.settings.model_validate(sections["search"])})
-        return config.made_of(Made(self.task, given, self.left_out, self.kept))
+        return config.made_of(Made(self.values.task, given, self.left_out, self.kept))
 
     @cached_property
     def idle(self) -> dict[str, str]:
@@ -96,7 +97,8 @@ class Reading:
         that method or kind. Nothing if the method is not known."""
         if self.settings is None:
             return {}
-        idle = {key: str(self.values["search.algorithm"]) for key in self.wanted if not has_effect(key, self.settings)}
+        method = str(self.values.given["search.algorithm"])
+        idle = {key: method for key in self.wanted if not has_effect(key, self.settings)}
         for key in self.wanted:
             if key not in idle and lacks(key, kind := self.values.get(kind_of(key)), self.settings):
                 idle[key] = f"{kind_of(key)} = {show(kind)}"
@@ -158,17 +160,20 @@ def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> 
     """Read what a config says."""
     name, file, wanted, unusable, problems = parsed
     defaults = {} if searches else {"search.algorithm": next(iter(known.algorithms)), "budget.generations": 1}
-    chosen = {**defaults, **file, **wanted}
-    task, settings, unknown = _chosen(chosen, parsed, known)
-    left_out = _left_out(file, wanted, Values(chosen, task, settings, known.rollouts), settings, known.algorithms)
-    file = {key: value for key, value in file.items() if key not in left_out}
+    left_out = _of_another_task(file, wanted)
+    file = _without(file, left_out)
     given = {**defaults, **file, **wanted}
+    task, settings, unknown = _chosen(given, unusable, known)
+    if settings is not None:
+        chosen = Values(given, task, settings, known.rollouts)
+        left_out |= (others := _of_another_method(file, wanted, chosen, settings, known.algorithms))
+        file, given = _without(file, others), _without(given, others)
     drafted = Values(given, task, settings, known.rollouts)
     kept = _kept(parsed, drafted, settings, known.algorithms)
     wrong = key_problems(given, wanted, drafted, settings, known.algorithms)
     idle = {key: value for key, value in given.items() if _is_idle(key, task, settings)}
     used = {key: value for key, value in given.items() if key not in {*wrong, *idle} and not asks(key, value)}
-    bad = value_problems(used, drafted, settings, known.algorithms)
+    bad = value_problems(used, settings, known.algorithms)
     options, wrong_options = ({}, []) if task is None else read_options(used, task)
     used = {key: value for key, value in used.items() if not key.startswith(TASK_OPTIONS)} | options
     invalid = {*bad, *wrong} | {key for key in FIELDS if key.split(".")[0] in unusable}
@@ -184,31 +189,35 @@ def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> 
         *unknown,
         *wrong_options,
         *missing,
+        *validator_problems(values),
         *_idle_problems(idle, values, known.algorithms, task),
         *problems_of(values, (*RULES, *START_RULES) if new else RULES),
     ]
     return Reading(name, file | dict(wanted), wanted, left_out, kept, values, problems, task, settings)
 
 
+def _without(values: Mapping[str, Any], left_out: Collection[str]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key not in left_out}
+
+
 def _chosen(
-    chosen: Mapping[str, Any], parsed: Parsed, known: Known
+    chosen: Mapping[str, Any], unusable: Collection[str], known: Known
 ) -> tuple[TaskSpec | None, type[SearchConfig] | None, list[Problem]]:
     """The task and the settings of the method that a config names, None where it names none, and the problems."""
 
     def task_of_name(name: str) -> TaskSpec:
         tasks = known.tasks
-        return tasks.chosen(name, **settings_of_task(*parsed[1:3])) if isinstance(tasks, Tasks) else tasks[name]
+        return tasks.chosen(name, **settings_of_task(chosen)) if isinstance(tasks, Tasks) else tasks[name]
 
     found: list[Any] = []
     problems: list[Problem] = []
-    others = "brax:NAME, mujoco:ID, gymnasium:ID, python:module:Class, function:module:name, or module:Class"
     for key, what, names, look_up, besides in (
-        ("task.environment", "task", known.tasks, task_of_name, others),
+        ("task.environment", "task", known.tasks, task_of_name, OTHER_TASKS),
         ("search.algorithm", "algorithm", known.algorithms, known.algorithms.__getitem__, "module:function"),
     ):
         given, allowed = chosen.get(key), f"{one_of(names)}, or {besides}"
         found.append(None)
-        if key not in chosen and key.split(".")[0] not in parsed.unusable:
+        if key not in chosen and key.split(".")[0] not in unusable:
             problems.append(problem_of(key, None, f"missing; must be {allowed}", allowed=allowed))
         try:
             if isinstance(given, str) and given != "":
@@ -226,35 +235,38 @@ def _chosen(
     return task, None if method is None else method.settings, problems
 
 
-def _left_out(
+def _is_replaced(key: str, file: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+    return key in wanted and wanted[key] != file.get(key)
+
+
+def _of_another_task(file: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, str]:
+    """See `Made.left_out`: what goes with a task that overrides replace."""
+    if not _is_replaced("task.environment", file, wanted):
+        return {}
+    why = f"{wanted['task.environment']} replaces its task"
+    return {key: why for key in file if (key.startswith(TASK_OPTIONS) or key in CHOICES) and key not in wanted}
+
+
+def _of_another_method(
     file: Mapping[str, Any],
     wanted: Mapping[str, Any],
     chosen: Values,
-    settings: type[SearchConfig] | None,
+    settings: type[SearchConfig],
     algorithms: Methods,
 ) -> dict[str, str]:
-    """See `Made.left_out`."""
+    """See `Made.left_out`: what goes with a method, or with the kind of a part, that overrides replace."""
     left_out: dict[str, str] = {}
-
-    def is_replaced(key: str) -> bool:
-        return key in wanted and wanted[key] != file.get(key)
-
-    if is_replaced("task.environment"):
-        why = f"{wanted['task.environment']} replaces its task"
-        left_out |= {key: why for key in file if key.startswith(TASK_OPTIONS) or key in CHOICES}
-    if settings is None:
-        return {key: why for key, why in left_out.items() if key not in wanted}
-    if other := is_replaced("search.algorithm"):
+    if other := _is_replaced("search.algorithm", file, wanted):
         known = file if ":" in str(file.get("search.algorithm")) else all_search_fields(algorithms)
         forbidden = {problem.field for problem in problems_of(chosen, METHOD_RULES)}
         forbidden |= {CLIP} if NORMALISED in forbidden else set()  # the bound is in standard deviations
         gone = {key for key in (*known, *settings.unused) if not has_effect(key, settings)} | forbidden
         left_out |= {key: replaces("search.algorithm", wanted["search.algorithm"]) for key in file if key in gone}
     for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
-        if other or is_replaced(kind):
+        if other or _is_replaced(kind, file, wanted):
             why, its = replaces(kind, chosen[kind]), [key for key in file if kind_of(key) == kind]
             left_out |= {key: why for key in its if lacks(key, chosen[kind], settings)}
-    return {key: why for key, why in left_out.items() if key not in wanted}
+    return _without(left_out, wanted)
 
 
 def _kept(parsed: Parsed, chosen: Values, settings: type[SearchConfig] | None, algorithms: Methods) -> dict[str, Kept]:

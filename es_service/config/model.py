@@ -6,9 +6,8 @@ presets, defaults and shapes and checks the sections against each other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, SerializeAsAny
@@ -41,8 +40,8 @@ class TaskConfig(Section):
     """The task that is to be learned. Constants of the run."""
 
     environment: Text = Field(
-        description="Name of the task: a shipped one, brax:NAME, mujoco:ID, gymnasium:ID, or one of your own: "
-        "module:Class in JAX, python:module:Class, or function:module:name."
+        description="Name of the task: a shipped one, brax:NAME, mujoco:ID, gymnasium:ID, gymnax:NAME, "
+        "playground:NAME, or one of your own: module:Class in JAX, python:module:Class, or function:module:name."
     )
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(
@@ -386,7 +385,7 @@ class Made:
     """What a config was made from."""
 
     task: TaskSpec
-    """The task from which values that were left open were resolved."""
+    """The task from which values that were left open were resolved, with the descriptor that its options choose."""
     given: Mapping[str, Any] = field(compare=False)
     """What was given, by dotted key."""
     left_out: Mapping[str, str] = field(compare=False)
@@ -431,11 +430,7 @@ class RunConfig(Section):
     def given_yaml(self, changes: Mapping[str, Any]) -> str:
         """The text of a config file that gives what this config was given, with some values changed by dotted key. This
         version makes the same config of it on this machine."""
-        sections: dict[str, Any] = {}
-        for key, value in {**self.made.given, **changes}.items():
-            *groups, leaf = key.split(".")
-            reduce(lambda section, group: section.setdefault(group, {}), groups, sections)[leaf] = value
-        return dump_yaml(sections)
+        return dump_yaml(nested({**self.made.given, **changes}))
 
     def constants(self) -> dict[str, Any]:
         """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""
@@ -458,3 +453,15 @@ def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         is_group = isinstance(value, Mapping) and prefix != TASK_OPTIONS
         values |= flat(value, f"{prefix}{key}.") if is_group else {f"{prefix}{key}": value}
     return values
+
+
+def nested(values: Mapping[str, Any], sections: Iterable[str] = ()) -> dict[str, Any]:
+    """Nested mappings from dotted keys, the inverse of `flat`; with these sections, even if they are empty."""
+    whole: dict[str, Any] = {section: {} for section in sections}
+    for name, value in values.items():
+        *path, leaf = name.split(".")
+        target = whole
+        for group in path:
+            target = target.setdefault(group, {})
+        target[leaf] = value
+    return whole

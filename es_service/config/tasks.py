@@ -14,8 +14,10 @@ from contextlib import suppress
 from functools import cache
 from typing import Any, TypeGuard
 
+from pydantic import TypeAdapter
+
 from es_service.config.model import RunConfig
-from es_service.config.parts import LARGEST, TASK_OPTIONS
+from es_service.config.parts import LARGEST, TASK_OPTIONS, as_tuple
 from es_service.config.resolution import options_of
 from es_service.config.text import in_line, nearest, one_of, problem_of, show, wrong_value
 from es_service.errors import ConfigError, Problem
@@ -78,6 +80,11 @@ def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
 
 CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode")
 """Keys of `HostChoices`."""
+OTHER_TASKS = (
+    "brax:NAME, mujoco:ID, gymnasium:ID, gymnax:NAME, playground:NAME, python:module:Class, function:module:name, or "
+    "module:Class"
+)
+"""Names of tasks that are not shipped, in words."""
 DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
 REPEATS_S = 20.0
@@ -94,8 +101,7 @@ def is_start(given: object, parameters: int) -> TypeGuard[list[float]]:
 
 
 class Tasks(Mapping[str, TaskSpec]):
-    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `mujoco:ID`,
-    `gymnasium:ID`, `module:Class`, `python:module:Class` and `function:module:name`."""
+    """Tasks by name. Iteration yields the shipped tasks; lookup also finds OTHER_TASKS."""
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
@@ -139,14 +145,15 @@ ROLLOUTS: Rollouts = BACKENDS
 
 def task_of(config: RunConfig) -> TaskSpec:
     """The task of a run, with the descriptor that its options choose, as it was when the config was loaded."""
-    return with_options(config.made.task, config.task.options)
+    return config.made.task
 
 
 def require_same_task(config: RunConfig) -> None:
     """Raise ConfigError if the task has changed since its values were filled into the config, such as its episode
     length: the run would have some values of the old task and some of the new one."""
     settings, before = config.task, config.made.task
-    task = TASKS.chosen(settings.environment, settings.options, settings.choices)
+    now = TASKS.chosen(settings.environment, settings.options, settings.choices)
+    task = with_options(now, settings.options)
     if changes := _changes(before, task):
         raise ConfigError(
             f"the task {task.name} has changed since this config was loaded ({', '.join(changes)}); load the config "
@@ -190,63 +197,33 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     return task_from_fields(answer["task"])
 
 
+_TASK = TypeAdapter(TaskSpec)
+
+
 def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
     """A TaskSpec from its fields as JSON has them, also those that a run stores, with tuples in place of lists.
 
     Fields that only older versions had are left out.
     """
-    known = {field.name for field in dataclasses.fields(TaskSpec)}
-
-    def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
-        return tuple((float(low), float(high)) for low, high in pairs)
-
-    def option(stored: Mapping[str, Any] | list) -> Option:
-        if isinstance(stored, list):  # as versions up to 0.11 stored the allowed values
-            return choice(*stored)
-        return Option(**{**stored, "choices": tuple(stored["choices"])})
-
-    return TaskSpec(
-        **{name: value for name, value in fields.items() if name in known}
-        | {
-            "descriptor_names": tuple(fields["descriptor_names"]),
-            "descriptor_bounds": bounds(fields["descriptor_bounds"]),
-            "action_bounds": bounds(fields.get("action_bounds", ())),
-            "walls": None if fields.get("walls") is None else tuple(bounds(wall) for wall in fields["walls"]),
-            "notes": tuple(fields.get("notes", ())),
-            "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
-            "parameters": None
-            if fields.get("parameters") is None
-            else ParameterSpec.from_fields(*fields["parameters"]),
-            "options": {name: option(stored) for name, stored in fields.get("options", {}).items()},
-            "descriptors": {
-                name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields.get("descriptors", {}).items()
-            },
-        }
-    )
+    options = fields.get("options", {})
+    of_lists = {name: choice(*stored) for name, stored in options.items() if isinstance(stored, list)}  # up to 0.11
+    return _TASK.validate_python({**fields, "options": {**options, **of_lists}})
 
 
-def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+def settings_of_task(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a config chooses for its task besides its name, as arguments of `Tasks.chosen`.
 
     Values of types that no task takes are left out; they are reported elsewhere.
-
-    Args:
-        values: those of the file.
-        wanted: those of overrides. If they choose another task, what the file says of its own is left out.
     """
-    name = "task.environment"
-    chosen = dict(wanted) if name in wanted and wanted[name] != values.get(name) else {**values, **wanted}
-    descriptor = chosen.get("task.descriptor")
-    if isinstance(descriptor, list):
-        descriptor = tuple(descriptor)
+    descriptor = as_tuple(values.get("task.descriptor"))
     is_chosen = descriptor and (isinstance(descriptor, str) or all(type(index) is int for index in descriptor))
-    options = {key: value for key, value in options_of(chosen).items() if is_plain(value)}
-    success = chosen.get("task.success")
+    success = values.get("task.success")
     choices = HostChoices(
         descriptor if is_chosen else None,
         success if isinstance(success, str) and success else None,
-        chosen.get("task.new_object_each_episode") is True,
+        values.get("task.new_object_each_episode") is True,
     )
+    options = {key: value for key, value in options_of(values).items() if is_plain(value)}
     return {"options": options, "choices": choices}
 
 

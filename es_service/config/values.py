@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from types import FunctionType, NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from es_service.config.given import nested
 from es_service.config.keys import (
     FIELDS,
-    KIND,
     SECTIONS,
     Methods,
     all_search_fields,
     methods_with,
-    parts_of,
     search_fields,
 )
-from es_service.config.model import RunConfig
-from es_service.config.parts import TASK_OPTIONS
-from es_service.config.resolution import LEFT_OPEN, Values
+from es_service.config.model import nested
+from es_service.config.parts import TASK_OPTIONS, Section
+from es_service.config.resolution import LEFT_OPEN, Unknown, Values
 from es_service.config.search import SearchConfig, preset_rows
 from es_service.config.text import not_allowed, one_of, problem_of, show, wrong_value
 from es_service.errors import Problem
@@ -30,36 +28,58 @@ from es_service.protocol.user_code import in_no_file
 
 
 def value_problems(
-    values: Mapping[str, Any], drafted: Values, settings: type[SearchConfig] | None, algorithms: Methods
+    values: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
 ) -> dict[str, Problem]:
-    """Key -> problem for each value that is invalid by itself. Missing keys are not reported here, nor are options.
+    """Key -> problem for each value that is invalid by itself. Keys that nobody has are not reported here, nor options.
 
     Args:
-        drafted: all values, of which the kinds of parts are needed.
-        settings: those of the method; None if it is not known: then those of the method that has most of the keys.
+        settings: those of the method; None if it is not known: then a value is invalid if no method allows it.
     """
-    if settings is None:
-        known = [method.settings for method in algorithms.values()]
-        settings = max(known, key=lambda candidate: len(values.keys() & search_fields(candidate)))
-    fields, parts = FIELDS | all_search_fields(algorithms) | search_fields(settings), parts_of(settings)
-    kinds = {key: drafted.get(key, fields[key].default) for part in parts if (key := f"{part}.{KIND}")}
-    plain = {key: value for key, value in {**kinds, **values}.items() if not key.startswith(TASK_OPTIONS)}
-    sections = nested(plain)
-    wrong_keys: set[str] = set()
+    methods = [method.settings for method in algorithms.values()] if settings is None else [settings]
     problems: dict[str, Problem] = {}
-    for model, section, mapping in ((RunConfig, (), sections), (settings, ("search",), sections.pop("search"))):
-        try:
-            model.model_validate(mapping)
-        except ValidationError as error:
-            for item in error.errors(include_url=False):
-                place = [str(component) for component in (*section, *item["loc"])]
-                if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
-                    place[2:3] = [] if len(place) > 2 else [KIND]
-                if not item["loc"]:  # a rule that the class of a user's search has
-                    problems["search"] = problem_of("search", None, item["msg"])
-                # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
-                wrong_keys |= {".".join(place[: k + 1]) for k in range(len(place))}
-    return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in wrong_keys}
+    for key, value in values.items():
+        having = [None] if key in FIELDS else [method for method in methods if key in search_fields(method)]
+        if having and not any(_is_allowed(key, value, method) for method in having):
+            problems[key] = _bad_value(key, value, _field(key, having[0]))
+    return problems
+
+
+def _field(key: str, settings: type[SearchConfig] | None) -> FieldInfo:
+    """The field of a key: of a method with these settings, or of every config."""
+    return FIELDS[key] if settings is None else search_fields(settings)[key]
+
+
+@cache
+def _type(key: str, settings: type[SearchConfig] | None) -> TypeAdapter:
+    """The type of a key's values, as a section validates them."""
+    field = _field(key, settings)
+    return TypeAdapter(Annotated[field.annotation, "", *field.metadata], config=Section.model_config)
+
+
+def _is_allowed(key: str, value: Any, settings: type[SearchConfig] | None) -> bool:
+    try:
+        _type(key, settings).validate_python(value)
+    except ValidationError:
+        return False
+    return True
+
+
+def validator_problems(values: Values) -> list[Problem]:
+    """The problems that validators find which the class of a search has, such as one of a user with two keys that must
+    fit each other."""
+    known = {key: value for key, value in values.known().items() if key.startswith("search.")}
+    try:
+        values.settings.model_validate(nested(known, ["search"])["search"])
+    except Unknown:
+        return []
+    except ValidationError as error:  # what else is wrong is reported elsewhere
+        raised = [item for item in error.errors() if item["type"] in ("value_error", "assertion_error")]
+        keys = [".".join(("search", *map(str, item["loc"][:1]))) for item in raised]
+        return [
+            problem_of(key, known.get(key), str(item.get("ctx", {})["error"]))
+            for key, item in zip(keys, raised, strict=True)
+        ]
+    return []
 
 
 def _bad_value(name: str, value: object, field: FieldInfo) -> Problem:

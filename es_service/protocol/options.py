@@ -26,8 +26,8 @@ class Option:
     default: OptionValue | None
     """None: no value unless one is given, which may be any plain one. Only our own tasks have such options: those of
     Gymnasium, whose environments then have what they have by themselves, and the start of a caller's episodes."""
-    low: float | None = None
-    high: float | None = None
+    low: int | float | None = None
+    high: int | float | None = None
     """Least and greatest value of a number, both allowed; None for no bound."""
     choices: tuple[OptionValue, ...] = ()
     """The only allowed values; empty if there are others."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from es_service.config.given import nested
 from es_service.config.keys import search_fields
 from es_service.config.loading import Known, read
-from es_service.config.model import flat
+from es_service.config.model import flat, nested
 from es_service.config.search import SearchConfig
 from es_service.config.tasks import ROLLOUTS
 from es_service.config.text import in_line

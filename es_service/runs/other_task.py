@@ -17,7 +17,7 @@ from es_service.config.parts import TASK_OPTIONS
 from es_service.config.tasks import TASKS, settings_of_task, task_of
 from es_service.config.text import show
 from es_service.errors import ConfigError, Problem
-from es_service.protocol.messages import EpisodesResult, TaskSpec, with_options
+from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.options import OptionValue, allowed_value, option_values
 from es_service.runs.certified import Elsewhere
 from es_service.runs.checked_config import load_config
@@ -115,7 +115,7 @@ def elsewhere_of(other: OtherTask, here: EpisodesResult, there: EpisodesResult) 
 def _described(name: str, wanted: Mapping[str, Any]) -> TaskSpec | None:
     """A task with what is set of it; None if there is none of this name, which loading a config says in full."""
     try:
-        return TASKS.chosen(name, **settings_of_task({}, {**wanted, ENVIRONMENT: name}))
+        return TASKS.chosen(name, **settings_of_task(wanted))
     except KeyError:
         return None
 
@@ -177,7 +177,7 @@ def _differences(
     config: RunConfig, here: TaskSpec, other: RunConfig, there: TaskSpec, given: Mapping[str, Any]
 ) -> tuple[str, ...]:
     """See `OtherTask.differences`; those of `given` options are meant."""
-    names = [with_options(task, of.task.options).descriptor_names for task, of in ((here, config), (there, other))]
+    names = here.descriptor_names, there.descriptor_names
     lacks = [
         *(["which episodes succeed"] if here.success and not there.success else []),
         *(["a distance to the goal"] if here.has_goal and not there.has_goal else []),

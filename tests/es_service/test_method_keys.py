@@ -114,6 +114,7 @@ def test_a_part_is_a_section_of_its_own():
     assert problems(MINIMAL, "search.step.kind=adma", "search.step.learning_rate=-1", "search.step.learning_rat=1") == [
         "search.step.learning_rat: unknown key; did you mean search.step.learning_rate?",
         "search.step.kind: adma is not allowed; must be adam, adamw, plain or clipup; did you mean adam?",
+        "search.step.learning_rate: -1 is not allowed; must be a number above 0",
     ]
     config = load(MINIMAL | {"search": {"algorithm": "nsr_es", "step": {"learning_rate": 1}}}, "search.step.kind=plain")
     assert config.search.step.model_dump() == {"kind": "plain", "learning_rate": 1.0, "l2": 0.005}
@@ -331,3 +332,22 @@ def test_shipped_configs_have_no_key_without_effect(path):
     settings = OURS[written["search.algorithm"]].settings
     assert all(has_effect(key, settings) for key in written)
     assert shipped_configs()
+
+
+def test_without_a_known_algorithm_only_what_no_algorithm_allows_is_wrong():
+    search = {"algorithm": "ess", "pairs": 8, "batch": 16, "sigma": 0, "elites": {"kind": "me_sampling", "depth": "x"}}
+    with pytest.raises(ConfigError) as caught:
+        load({**MINIMAL, "search": search})
+    assert [problem.sentence for problem in caught.value.problems][:-1] == [
+        "search.sigma: 0 is not allowed; must be a number above 0",
+        "search.elites.depth: x is not allowed; must be a whole number, at least 1",
+    ]
+
+
+def test_what_overrides_set_in_vain_is_known_although_their_section_is_unusable():
+    reading = read(
+        {**MINIMAL, "search": None},
+        ["search.algorithm=map_elites", "search.pairs=8"],
+        Known(TASKS, ALGORITHMS, BACKENDS),
+    )
+    assert reading.idle == {"search.pairs": "map_elites"}

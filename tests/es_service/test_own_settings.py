@@ -109,6 +109,33 @@ def test_a_wrong_value_is_one_line_with_what_is_allowed(own, given, message):
     assert problems(own, f"search.{given}") == [f"search.{given.split('=')[0]}: {message}"]
 
 
+def test_what_validators_of_the_class_find_is_told_with_all_other_problems(own, tmp_path):
+    """Also where a preset gives keys that the config leaves out, such as search.pairs."""
+    validators = """
+    @field_validator("note")
+    @classmethod
+    def _is_short(cls, note: str) -> str:
+        assert len(note) < 9, "must be short"
+        return note
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Settings":
+        if self.gap > self.count:
+            raise ValueError("gap must not be above count")
+        return self
+"""
+    text = KINDS_OF_KEYS.replace('note: str = "plain"\n', f'note: str = "plain"\n{validators}')
+    text = text.replace("import Field\n", "import Field, field_validator, model_validator\n")
+    (tmp_path / "kinds_of_keys.py").write_text(text)
+    assert problems(own, "search.gap=5", "map.cells=[0]") == [
+        "map.cells: [0] is not allowed; must be auto or a list of whole numbers, each at least 1, such as [20, 20], or "
+        "one such number",
+        "search: gap must not be above count",
+    ]
+    assert problems(own, "search.note=much too long") == ["search.note: must be short"]
+    assert api.load_config(own, ["search.gap=5", "search.count=6"]).search.gap == 5.0
+
+
 def test_a_key_without_a_default_must_be_given(own, tmp_path):
     (tmp_path / "kinds_of_keys.py").write_text(KINDS_OF_KEYS.replace("fast: bool = False", "fast: bool"))
     assert problems(own, "seed=-1")[1:] == ["search.fast: missing; must be true or false"]

@@ -42,7 +42,7 @@ def task_named(name: str, options: Mapping[str, OptionValue]) -> TaskSpec:
         TaskError: there is no such task, it has no such option, or it is of a kind that is no such environment.
     """
     if not isinstance(name, str) or (":" not in name and name not in SHIPPED):
-        others = "brax:NAME, mujoco:ID or module:Class"
+        others = "brax:NAME, mujoco:ID, gymnax:NAME, playground:NAME or module:Class"
         raise TaskError(f"task = {name!r} is not shipped; choose among {', '.join(SHIPPED)}, {others}")
     if is_host_task(name):
         raise TaskError(f"task = {name!r} is a Python object, no task in JAX; step it by itself")
