@@ -53,7 +53,8 @@ def _field(key: str, settings: type[SearchConfig] | None) -> FieldInfo:
 def _type(key: str, settings: type[SearchConfig] | None) -> TypeAdapter:
     """The type of a key's values, as a section validates them."""
     field = _field(key, settings)
-    return TypeAdapter(Annotated[field.annotation, "", *field.metadata], config=Section.model_config)
+    annotated: Any = Annotated[field.annotation, "", *field.metadata]
+    return TypeAdapter(annotated, config=Section.model_config)
 
 
 def _is_allowed(key: str, value: Any, settings: type[SearchConfig] | None) -> bool:

@@ -133,7 +133,7 @@ def test_a_wrong_declaration_says_what_is_wrong(options, problem):
 def test_a_task_keeps_its_options_in_the_run_store_and_those_of_older_versions_are_read():
     task = replace(POINT_MAZE, options=OPTIONS)
     stored = json.loads(json.dumps(asdict(task)))
-    assert task_from_fields(stored) == task
+    assert repr(task_from_fields(stored)) == repr(task)  # bounds that are whole numbers stay so
     older = stored | {
         "options": {"start": ["default", "corner"]},
         "no_simd": "only older ones had it",
