@@ -1,5 +1,5 @@
-"""What a caller is asked to compute: the episodes of chunks as rows, results of the chunks from what it
-tells, and descriptions of the episodes of a chunk whose worker was lost, so that a user can run them alone.
+"""What a caller is asked to compute: the episodes of chunks as rows, results of the chunks from what it tells,
+and descriptions of the episodes of a chunk whose worker was lost, so that a user can run them alone.
 
 Axes: N rows, D policy parameters, O observation, B descriptor dimensions, T points of a trace.
 """

@@ -25,6 +25,8 @@ from es_service.config.text import in_line, show
 from es_service.config.workload import config_warnings
 from es_service.errors import ServiceError, WayOut
 
+PROGRAM = "es-service"
+
 
 def text_console(*, stderr: bool = False, width: int | None = None) -> Console:
     """A console that prints text as it is; `width` is that of the terminal by default."""
@@ -38,9 +40,6 @@ errors = text_console(stderr=True)
 def print_line(console: Console, text: str, style: str | None = None) -> None:
     """Print text without wrapping or cutting its lines, so that folders and commands can be copied."""
     console.print(text, style=style, soft_wrap=True)
-
-
-PROGRAM = "es-service"
 
 
 def command(*words: object) -> str:

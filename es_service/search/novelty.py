@@ -29,6 +29,8 @@ produce many such entries, and each query near them would visit them all."""
 
 @dataclass(frozen=True)
 class Tree:
+    """A k-d tree over the first entries of an archive."""
+
     kd: KDTree
     entries: int
     """Number of those entries."""

@@ -35,6 +35,8 @@ LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.u
 
 
 class Kernels(NamedTuple):
+    """Compiled functions of a task."""
+
     begin: Kernel | None
     step: Kernel | None
     """None: xla has to compute it, and then the reset too."""

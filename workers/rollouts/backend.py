@@ -31,6 +31,8 @@ BAD_REWARD, NO_FAULT = 2**31 - 2, 2**31 - 1
 
 
 class FailedEpisode(NamedTuple):
+    """Why an episode is invalid."""
+
     lane: int
     """Place of its policy in the chunk: of a training chunk 2 p + s for member s of pair p, of others the slot."""
     text: str

@@ -70,6 +70,8 @@ class Pointer(NamedTuple):
 
 
 class StepCall(NamedTuple):
+    """A call of a function in each step."""
+
     function: FunctionBuilder
     pointers: tuple[str, ...]
     """Names of the kernel's pointers that are its arguments."""

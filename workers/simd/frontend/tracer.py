@@ -100,6 +100,8 @@ def primitive(*names: str) -> Callable[[PrimitiveRule], PrimitiveRule]:
 
 
 class EquationPlace(NamedTuple):
+    """Where an equation comes from."""
+
     source: source_info_util.SourceInfo
     outer: EquationPlace | None
     """The equation whose function contains it."""
