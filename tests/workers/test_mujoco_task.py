@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from es_service import api
 from es_service.cli.doctor import step_findings
 from es_service.protocol.errors import TaskError
 from es_service.protocol.sources import modules_of, user_sources
+from es_service.runs.certification import certify, certify_run
 from workers.environments import describe_environment, make_environment
 from workers.environments.mujoco_parts import mujoco
 from workers.step_cost import LANES, step_cost
@@ -258,3 +260,28 @@ def test_the_arm_of_the_examples_reaches_its_target_in_its_model():
     np.testing.assert_allclose(environment.goal_distance(state), np.hypot(0.55, 0.82), rtol=1e-5)
     assert not bool(environment.success(state, jnp.bool_(True)))
     assert "tests/examples/reaching_arm.xml" in user_sources(ARM)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_process")
+def test_a_short_training_of_the_arm_is_certified_to_be_better_than_a_random_policy(tmp_path):
+    """Whole intervals of 95 % apart; and the policies move the hand to different places."""
+    task = {"environment": ARM, "episode_steps": 50}
+    search = {"algorithm": "es", "pairs": 32, "sigma": 0.1, "step": {"kind": "adam", "learning_rate": 0.1}}
+    config = api.load_config(
+        {
+            "task": task,
+            "policy": {"hidden": []},
+            "search": search | {"evaluation_episodes": 4},
+            "budget": {"generations": 12},
+            "compute": {"engine": "inline", "workers": 1},
+        }
+    )
+    run = api.run(config, tmp_path / "arm", progress=False).run
+    [trained] = certify_run(run.folder, top=0, episodes=64)
+    random_N_D = 0.3 * np.random.default_rng(0).normal(size=(4, trained.parameters_D.size))
+    random = certify(random_N_D, config, episodes=64, keep=4)
+    print("\n", trained.row()["return_low"], [one.row()["return_high"] for one in random])
+    assert trained.row()["return_low"] > max(one.row()["return_high"] for one in random)
+    assert np.isfinite(trained.episodes.goal_distance_E).all()
+    assert np.ptp([one.episodes.descriptor_E_B.mean(0) for one in random], axis=0).max() > 0.1
