@@ -32,8 +32,8 @@ from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import UNBOUNDED, Centre, EpisodesResult, TaskSpec, TrainingChunk
 from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.protocol.system import memory_bytes
-from es_service.runs.repeating import compared, examined
 from es_service.runs.signals import stop_on_signals
+from es_service.runs.verification import compared, examined
 from es_service.search.observation_statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from workers.policies.policy import initial_parameters

@@ -25,7 +25,7 @@ from es_service.cli.sweep import GridOption, ParallelOption, SeedsOption, grid_o
 from es_service.config.given import parse_overrides, read_config
 from es_service.errors import ConfigError
 from es_service.runs import jobs
-from es_service.runs.job_package import JobPackage, run_package, sweep_package
+from es_service.runs.jobs import JobPackage, run_package, sweep_package
 from es_service.runs.sweep_plan import plan
 
 job_commands = typer.Typer()

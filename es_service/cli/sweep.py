@@ -48,7 +48,7 @@ from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import OnProgress, SweptRun, run_planned
 from es_service.runs.sweep_commands import Certifying
 from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
-from es_service.runs.trackers import check_trackers
+from es_service.runs.tracking import check_trackers
 
 SeedsOption = Annotated[
     str | None,

@@ -12,8 +12,12 @@ from es_service.cli.options import JsonOption, LogLevelOption, RunArgument
 from es_service.cli.printing import console, print_error, print_json, print_line, print_note
 from es_service.errors import RunLockedError
 from es_service.runs.checked_config import changed_config
-from es_service.runs.repeating import why_not_repeatable
-from es_service.runs.verification import Recomputed, RecomputedCertification, recomputed_certifications
+from es_service.runs.verification import (
+    Recomputed,
+    RecomputedCertification,
+    recomputed_certifications,
+    why_not_repeatable,
+)
 from es_service.runs.verification import verify as recompute
 
 

@@ -18,6 +18,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import count
 
+from es_service.dispatch.cores import places
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import (
@@ -31,7 +32,6 @@ from es_service.dispatch.events import (
     WorkerUp,
     with_last_words,
 )
-from es_service.dispatch.gpus import places
 from es_service.dispatch.staying import staying
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.kept import Kept

@@ -1,19 +1,24 @@
-"""The calls of Ray actors: those that have not been answered yet, and the arguments of those that get chunks."""
+"""The calls of Ray actors: those that have not been answered yet, the arguments of those that get chunks, what messages
+say about their faults, and the nodes that must not work for a run."""
 
 from __future__ import annotations
 
 import pickle
+import re
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from types import ModuleType
 from typing import Any
 
 from es_service.dispatch.events import Progress
+from es_service.dispatch.ray_nodes import Membership
+from es_service.errors import EvaluationError
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce, forget_old_subjects
 from es_service.protocol.messages import FloatArray, Report, Subject, Work, recipes_in
+from es_service.protocol.raised import RaisedError
 from es_service.protocol.recipes import Origin
 
 IN_CALL_BYTES = 64 * 2**10
@@ -187,3 +192,68 @@ class Arguments:
         """The subject, pickled, or the reference under which Ray has stored that."""
         pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
         return pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+
+
+def fault_reason(error: Exception) -> str:
+    """Cause of an actor's fault, on one line."""
+    first = error_text(error).strip().partition("\n")[0]
+    known = {
+        "OutOfMemoryError": "its node ran out of memory and Ray killed it",
+        "ActorUnavailableError": "its node does not answer",
+        "ActorDiedError": "its process or its node died",
+    }
+    kind = type(error).__name__
+    return f"{known.get(kind, kind)}: {first}"
+
+
+def raised_in_actor(error: Exception) -> RaisedError:
+    """The exception of an actor's call, which `workers.actor` has turned into texts."""
+    cause = getattr(error, "cause", None)
+    return cause if isinstance(cause, RaisedError) else RaisedError(error_text(error), "")
+
+
+def error_text(error: Exception) -> str:
+    """Text of an error without the colour codes that Ray adds."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+
+
+class Refusals:
+    """Nodes that refuse. They get no more workers, and the user is told of each host once."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._nodes: dict[str, str] = {}
+        """Node id -> what its first worker said, which names the host and the files."""
+
+    def __bool__(self) -> bool:
+        return bool(self._nodes)
+
+    def add(self, node: str, said: str) -> None:
+        """Remember what a worker said on a node, and tell it if it is new."""
+        if said not in self._nodes.values():
+            self._tell(said)
+        self._nodes.setdefault(node, said)
+
+    def without(self, nodes: Membership) -> Membership:
+        """The nodes of the cluster, of which those that refuse give no room."""
+        rooms, free = (
+            {node: 0 if node in self._nodes else room for node, room in of.items()} for of in (nodes.rooms, nodes.free)
+        )
+        return replace(nodes, rooms=rooms, free=free)
+
+    def check(self, nodes: Membership | None) -> None:
+        """Raise EvaluationError if no other node has room.
+
+        Args:
+            nodes: those of the cluster that was joined; None: a Ray of our own, with one node.
+        """
+        if nodes is None or not self.without(nodes).room:
+            raise EvaluationError(str(self))
+
+    def elsewhere(self) -> dict[str, Any]:
+        """Options of an actor that Ray must not place on these nodes. If no other node has room, the actor waits."""
+        selector = {"ray.io/node-id": f"!in({','.join(sorted(self._nodes))})"}
+        return {"scheduling_strategy": "SPREAD", "label_selector": selector}
+
+    def __str__(self) -> str:
+        return "; ".join(dict.fromkeys(self._nodes.values()))

@@ -23,11 +23,19 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_calls import LOOK_S, LOOKS, Arguments, Call, Calls, Looks
+from es_service.dispatch.ray_calls import (
+    LOOK_S,
+    LOOKS,
+    Arguments,
+    Call,
+    Calls,
+    Looks,
+    Refusals,
+    fault_reason,
+    raised_in_actor,
+)
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
-from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
-from es_service.dispatch.ray_refusals import Refusals
 from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
 from es_service.protocol.raised import raised

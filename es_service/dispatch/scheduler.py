@@ -20,8 +20,8 @@ Rules:
 * Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
   attempt only if they were started after the first of them was lost.
 
-assignment.py decides which worker gets which item, and deadlines.py how long it may take. stragglers.py decides which
-items are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
+assignment.py decides which worker gets which item, how long it may take, and which items are sent a second time.
+scheduler_changes.py keeps the containers of the state consistent.
 
 Cost: an event looks only at the workers and items that it concerns and at those that it stops or assigns
 (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the run, and events before a first worker is up
@@ -33,14 +33,16 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 
-from es_service.dispatch.assignment import assign
-from es_service.dispatch.deadlines import (
+from es_service.dispatch.assignment import (
     RECENT_DURATIONS,
+    assign,
     begin_first_slot,
     missed_deadline,
     note_compiled,
+    note_late_workers,
     note_progress,
     plain,
+    send_copies,
     start_deadline,
 )
 from es_service.dispatch.events import (
@@ -80,7 +82,6 @@ from es_service.dispatch.scheduler_state import (
     next_deadline,
     without,
 )
-from es_service.dispatch.stragglers import note_late_workers, send_copies
 
 
 def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:

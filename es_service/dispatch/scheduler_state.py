@@ -103,7 +103,7 @@ class SchedulerState:
     places: SortedList = field(default_factory=SortedList)
     """(place, id) of every work item in the queue."""
     late: SortedList = field(default_factory=SortedList)
-    """(place, id) of every work item that may be sent a second time, see stragglers.py."""
+    """(place, id) of every work item that may be sent a second time, see assignment.py."""
     durations_s: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """Kind -> recent durations of one chunk, without compiling."""
     next_worker: int = 0
@@ -214,7 +214,7 @@ def next_time(worker: Worker) -> float:
 
 
 def has_idle_worker_for_copies(state: SchedulerState) -> bool:
-    """Whether the queue is empty, and an idle worker can take an item of another one, as stragglers.py explains."""
+    """Whether the queue is empty, and an idle worker can take an item of another one, as assignment.py explains."""
     if not state.late or state.places or state.limits.late_factor == math.inf:
         return False
     slots, pace, *_ = state.free[0] if state.free else (1, NEW)

@@ -21,8 +21,14 @@ from es_service.errors import StoreError
 from es_service.loop.forms import BOOL, INTEGER, REAL, Sizes, array_problem
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, seed_for
-from es_service.runs.intervals import false_pass_share, gap_interval, share_gap_interval
-from es_service.runs.selection import Episodes, Measure, interval_columns
+from es_service.runs.selection import (
+    Episodes,
+    Measure,
+    false_pass_share,
+    gap_interval,
+    interval_columns,
+    share_gap_interval,
+)
 from es_service.runs.strangers import sizes_of
 from es_service.store.certifications import CertifiedRow
 from es_service.store.facts import Damaged, Form, require_form

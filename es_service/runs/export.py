@@ -17,7 +17,7 @@ from es_service.protocol.parameters import ParameterSpec
 from es_service.runs.certified import newest_certified
 from es_service.runs.onnx import about, model_card, onnx_model
 from es_service.runs.snapshot import Policy, Snapshot, map_places
-from es_service.runs.trackers import TensorBoard, check_trackers, fill
+from es_service.runs.tracking import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, named_best, named_by_all
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid

@@ -1,4 +1,7 @@
-"""Sending the history of a run to trackers while it runs.
+"""Experiment trackers that show the history of a run while it runs: TensorBoard, Weights & Biases, and MLflow.
+
+A tracker knows the newest generation that it has of a run, and takes the rows after it, so that it gets every row once,
+whenever it is opened. Its entry is found again by the run's id. Each package is imported when its tracker is opened.
 
 Each tracker has a thread, which reads committed rows from the store and sends those that the tracker does not have. So
 the driver never waits for a tracker, and a tracker that stopped in the middle gets what it lacks in the next session.
@@ -6,15 +9,229 @@ the driver never waits for a tracker, and a tracker that stopped in the middle g
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import math
 import os
+import re
+import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Protocol
 
+from es_service.config.text import unknown_name
+from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import Row
 from es_service.runs.session import OnNotice
-from es_service.runs.trackers import Tracker, check_trackers, fill, open_tracker
 from es_service.runs.view import Run, open_run
+from es_service.store.reader import read_history
+
+PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
+"""Name of a tracker, which is also that of the extra of this package -> the module that it needs."""
+PROJECT = "es-service"
+"""Project or experiment in which entries are made, unless the tracker's own environment variables name another."""
+RUN_TAG = "es_service.run"
+MOST_ROWS = 1000
+"""History rows that are read and sent at once."""
+MLFLOW_BATCH = 1000
+"""Most metrics that MLflow takes at once."""
+
+
+class Tracker(Protocol):
+    """The entry of a run in a tracker."""
+
+    def newest(self) -> int:
+        """Newest generation that the tracker has; -1 if it has none."""
+        ...
+
+    def log(self, rows: Sequence[Row]) -> None:
+        """Add history rows, whose generations are all newer than `newest`, in their order."""
+        ...
+
+    def close(self) -> None:
+        """Finish all writing."""
+        ...
+
+
+def check_trackers(names: Sequence[str]) -> None:
+    """Check that trackers exist and that their packages are installed. Raises ConfigError."""
+    for name in names:
+        if name not in PACKAGES:
+            raise unknown_name("tracker", name, PACKAGES, "log")
+        spec = importlib.util.find_spec(PACKAGES[name])
+        if spec is None or spec.origin is None:  # a folder of the same name, as wandb makes it, is no package
+            ways_out = [WayOut("install", "install it", extra=name)]
+            sentence = f"the tracker {name} needs the package {PACKAGES[name]}"
+            raise ConfigError(sentence, field="log", value=name, ways_out=ways_out)
+
+
+def open_tracker(name: str, run: Run) -> Tracker:
+    """The entry of a run in a tracker, which is made if there is none; `name` is a key of PACKAGES."""
+    made: dict[str, Callable[[Run], Tracker]] = {"tensorboard": TensorBoard, "wandb": Wandb, "mlflow": MLflow}
+    return made[name](run)
+
+
+def fill(tracker: Tracker, run: Run, newest: int) -> int:
+    """Send the rows after generation `newest` to a tracker; returns the newest generation that was sent."""
+    while rows := read_history(run.folder, newest + 1, MOST_ROWS):
+        tracker.log(rows)
+        newest = int(rows[-1]["generation"])
+    return newest
+
+
+def metrics(row: Row) -> dict[str, float]:
+    """The values of a history row that a tracker shows: all finite numbers but the generation."""
+    return {
+        name: float(value)
+        for name, value in row.items()
+        if name != "generation" and value is not None and math.isfinite(value)
+    }
+
+
+def _time(run: Run, row: Row) -> float:
+    """Seconds since 1970 at which a generation is shown: pauses between sessions are left out."""
+    return datetime.fromisoformat(run.meta.created).timestamp() + row["wall_clock_s"]
+
+
+class TensorBoard:
+    """Event files in `RUN/tensorboard` or another folder; their names contain the run's id."""
+
+    def __init__(self, run: Run, folder: Path | None = None) -> None:
+        self._run, self._folder = run, folder or run.folder / "tensorboard"
+        self._writer: Any = None
+
+    def files(self) -> list[Path]:
+        """The event files of this run."""
+        mark = f".{self._run.run_id}."
+        there = self._folder.iterdir() if self._folder.is_dir() else ()
+        return sorted(file for file in there if file.name.startswith("events.out.tfevents.") and mark in file.name)
+
+    def newest(self) -> int:
+        event_type = importlib.import_module("tensorboardX.proto.event_pb2").Event
+        events = (event_type.FromString(record) for file in self.files() for record in _records(file.read_bytes()))
+        return max((event.step for event in events if event.HasField("summary")), default=-1)
+
+    def log(self, rows: Sequence[Row]) -> None:
+        made_by = importlib.import_module("tensorboardX.event_file_writer")
+        event = importlib.import_module("tensorboardX.proto.event_pb2").Event
+        summary = importlib.import_module("tensorboardX.proto.summary_pb2").Summary
+        for row in rows:
+            if self._writer is None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                # A session that begins within a second of the last one must not replace its file.
+                suffix = f".{self._run.run_id}.{row['generation']}"
+                self._writer = made_by.EventsWriter(str(self._folder / "events"), suffix)
+            values = [summary.Value(tag=name, simple_value=value) for name, value in metrics(row).items()]
+            self._writer.write_event(
+                event(wall_time=_time(self._run, row), step=row["generation"], summary=summary(value=values))
+            )
+        if rows:
+            self._writer.flush()
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _records(data: bytes) -> Iterator[bytes]:
+    """Records of an event file: length, checksum, content, checksum; a torn one at the end is left out."""
+    at = 0
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from("<Q", data, at)
+        if at + length + 16 > len(data):
+            return
+        yield data[at + 12 : at + 12 + length]
+        at += length + 16
+
+
+class Wandb:
+    """A run of Weights & Biases with the id of our run; its files are in `RUN/wandb`.
+
+    Without a network (WANDB_MODE=offline), the server cannot say what it has, so the newest generation is noted in a
+    file beside those that `wandb sync` uploads.
+    """
+
+    def __init__(self, run: Run) -> None:
+        wandb = importlib.import_module("wandb")
+        shared = wandb.setup(wandb.Settings(silent=True)).settings
+        if shared.mode == "online" and not wandb.login(prompt=False):
+            raise PermissionError("there is no API key; set WANDB_API_KEY, or WANDB_MODE=offline")
+        self._note = run.folder / "wandb" / f"{run.run_id}.newest"
+        self._entry = wandb.init(
+            project=shared.project or PROJECT,
+            id=run.run_id,
+            name=run.folder.absolute().name,
+            dir=str(run.folder),
+            config=run.constants,
+            resume="allow",
+            settings=wandb.Settings(console="off", silent=True, reinit="create_new"),
+        )
+
+    def newest(self) -> int:
+        if self._entry.offline:
+            return int(self._note.read_text()) if self._note.exists() else -1
+        return self._entry.starting_step - 1
+
+    def log(self, rows: Sequence[Row]) -> None:
+        for row in rows:
+            self._entry.log(metrics(row), step=row["generation"], commit=True)
+        if rows:
+            self._note.parent.mkdir(exist_ok=True)
+            self._note.write_text(str(rows[-1]["generation"]))
+
+    def close(self) -> None:
+        self._entry.finish()
+
+
+class MLflow:
+    """A run of MLflow; since MLflow chooses the ids of its runs, ours is its tag `es_service.run`."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._entities = importlib.import_module("mlflow.entities")
+        self._client = importlib.import_module("mlflow.tracking").MlflowClient()
+        name = os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT)
+        experiment = self._client.get_experiment_by_name(name)
+        at = experiment.experiment_id if experiment is not None else self._client.create_experiment(name)
+        runs = self._client.search_runs([at], f"tags.`{RUN_TAG}` = '{run.run_id}'")
+        if runs:
+            self._id = runs[0].info.run_id
+            self._client.update_run(self._id, status="RUNNING")
+            return
+        entry = self._client.create_run(at, run_name=run.folder.absolute().name, tags={RUN_TAG: run.run_id})
+        self._id = entry.info.run_id
+        settings = [self._entities.Param(_key(key), str(value)) for key, value in run.constants.items()]
+        self._client.log_batch(self._id, params=settings)
+
+    def newest(self) -> int:
+        return max((metric.step for metric in self._client.get_metric_history(self._id, "env_steps")), default=-1)
+
+    def log(self, rows: Sequence[Row]) -> None:
+        batch: list[Any] = []
+        for row in rows:
+            milliseconds = round(1000 * _time(self._run, row))
+            values = metrics(row)
+            if len(batch) + len(values) > MLFLOW_BATCH:
+                self._client.log_batch(self._id, metrics=batch)
+                batch = []
+            batch += [
+                self._entities.Metric(_key(name), value, milliseconds, row["generation"])
+                for name, value in values.items()
+            ]
+        if batch:
+            self._client.log_batch(self._id, metrics=batch)
+
+    def close(self) -> None:
+        self._client.set_terminated(self._id)
+
+
+def _key(name: str) -> str:
+    """A name with only those letters that MLflow allows."""
+    return re.sub(r"[^\w./ -]", "_", name, flags=re.ASCII)
+
 
 PAUSE_S = 1.0
 """Seconds between two readings of the history, so that a fast run is read in larger pieces."""

@@ -1,5 +1,6 @@
-"""Computing generations of a run again on this machine, from the states that the run keeps, and comparing the bits; and
-so the episodes of its certifications.
+"""Computing generations of a run again on this machine, from the states that the run keeps, and comparing the bits;
+so the episodes of its certifications; and whether its task repeats itself: equal seeds and actions have equal results,
+bit for bit, wherever it runs.
 
 Every generation has in its history the SHA-256 of its whole state, so a recomputed generation can be judged even if its
 state is not kept: a kept state is only needed as a beginning.
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
@@ -19,16 +21,17 @@ from es_service.loop.contents import Contents
 from es_service.loop.finished import Finished, reachable_in, rows
 from es_service.loop.generation import initial_state
 from es_service.loop.history import HistoryRow, Table
+from es_service.protocol.child import NoAnswerError, answer_of
 from es_service.protocol.content import Arrays
 from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
+from es_service.protocol.raised import RaisedError
 from es_service.runs.certification import platform_of, workers_for
 from es_service.runs.certified import Certified, Elsewhere, all_certifications, arrays_of
 from es_service.runs.engine import engine_here
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.other_task import stored_task
-from es_service.runs.repeating import why_task_does_not_repeat
 from es_service.runs.selection import Episodes, new_episodes
 from es_service.runs.session import initial_centres, initial_statistics
 from es_service.runs.view import Run
@@ -39,6 +42,7 @@ from es_service.store.lock import require_unlocked
 from es_service.store.rows import HistoryRow as StoredRow
 from es_service.store.states import KeptRows, rows_in_force
 from es_service.store.tables import table_bytes
+from workers.environments import settings_of_description
 
 
 @dataclass(frozen=True)
@@ -247,3 +251,52 @@ def _differing(engine: Evaluator, config: RunConfig, policy: Certified, then: Ep
     [episodes] = new_episodes(engine, [policy.policy], then.count, seed, policy.number, 0, domain)
     before, again = arrays_of(then), arrays_of(episodes)
     return tuple(name for name in before if name not in again or before[name].tobytes() != again[name].tobytes())
+
+
+ALONE = "alone"
+"""Name of the first episode among the hashes of `workers.host.examine`."""
+LONGEST_S = 600.0
+"""Longest time of each of the two processes; functions may take long."""
+
+
+def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """What `workers.host.examine` finds of a task of Python objects or a function in a process of its own.
+
+    Args:
+        settings: see `settings_of_description`.
+        seconds: duration of its measurement.
+    """
+    try:
+        return answer_of("workers.host.examine", name, settings, request=(seconds,), limit_s=LONGEST_S)
+    except RaisedError as error:
+        return {"problem": error.message}
+    except NoAnswerError as error:
+        return {"problem": f"it could not be examined: its process {error}", "is_lost": True}
+
+
+def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """(where a task was tried again, where it has not repeated itself) by two results of `examined`."""
+    same = {**first["hashes"], "in another process": second["hashes"][ALONE]}
+    tried = [where for where in same if where != ALONE]
+    return tried, [where for where in tried if same[where] != same[ALONE]]
+
+
+def why_not_repeatable(run: Run, config: RunConfig) -> str:
+    """Where the task of a run does not repeat itself, in words: as the run has recorded, or else as examined now.
+
+    Empty if it repeats itself, as far as can be found, and for tasks in JAX.
+    """
+    return run.meta.task.get("does_not_repeat") or why_task_does_not_repeat(config)
+
+
+def why_task_does_not_repeat(config: RunConfig) -> str:
+    """As `why_not_repeatable`, for the task of a config as it is examined now."""
+    task = task_of(config)
+    if task.kind not in ("python", "function"):
+        return ""
+    options = config.task.options
+    settings = settings_of_description(config.task.environment, options, config.task.choices) | {"options": options}
+    answers = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
+    if any("problem" in answer for answer in answers):
+        return ""
+    return " and ".join(compared(*answers)[1])

@@ -11,8 +11,7 @@ from es_service.config.model import ENGINE_IMPLIES, RunConfig, implied_by
 from es_service.config.parts import RESOURCES
 from es_service.config.tasks import CALLER
 from es_service.config.workload import chunks_at_once
-from es_service.dispatch.cores import cores
-from es_service.dispatch.gpus import places
+from es_service.dispatch.cores import cores, places
 from es_service.errors import ConfigError, WayOut, counted
 
 GPU = f"{RESOURCES}gpu"

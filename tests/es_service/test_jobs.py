@@ -24,8 +24,8 @@ from es_service.config.text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.protocol.sources import driver_sources, worker_sources
 from es_service.runs import jobs
-from es_service.runs.job_package import CONFIG as SENT_CONFIG
-from es_service.runs.job_package import JobPackage, run_package, write_package
+from es_service.runs.jobs import CONFIG as SENT_CONFIG
+from es_service.runs.jobs import JobPackage, run_package, write_package
 
 ROOT = Path(__file__).parents[2]
 CONFIG = load_config(

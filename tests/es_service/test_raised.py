@@ -13,7 +13,7 @@ import yaml
 
 from es_service import api
 from es_service.dispatch.events import because
-from es_service.dispatch.ray_faults import raised_in_actor
+from es_service.dispatch.ray_calls import raised_in_actor
 from es_service.errors import ConfigError
 from es_service.protocol.raised import RaisedError, raised, users_error
 from tests.system.command_line import PROGRAM, command

@@ -12,7 +12,7 @@ import pytest
 from test.support import catch_unraisable_exception
 
 from es_service.config.workload import ANY_NUMBER
-from es_service.dispatch import ray_cluster, ray_nodes, ray_side_effects
+from es_service.dispatch import ray_cluster, ray_nodes
 from es_service.dispatch.events import Limits
 from es_service.errors import EvaluationError, Interrupted
 from tests.system.processes import wait_for
@@ -26,7 +26,7 @@ def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
     before, touched = dict(os.environ), []
     for function in ("putenv", "unsetenv"):
         monkeypatch.setattr(os, function, lambda name, *_: touched.append(name))
-    with ray_side_effects.environment_kept({"OLD": "new", "NEW": "new"}):
+    with ray_cluster.environment_kept({"OLD": "new", "NEW": "new"}):
         os.environ["RAYS_OWN"] = "1"
         assert os.environ["OLD"] == os.environ["NEW"] == "new"
     assert dict(os.environ) == before

@@ -26,8 +26,7 @@ from es_service.runs.certified import (
     target_reached,
     tries_sentence,
 )
-from es_service.runs.intervals import false_pass_share, mean_interval
-from es_service.runs.selection import Episodes
+from es_service.runs.selection import Episodes, false_pass_share, mean_interval
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
 

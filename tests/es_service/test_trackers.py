@@ -15,7 +15,7 @@ from es_service import open_run
 from es_service.errors import ConfigError, StoreError
 from es_service.runs import tracking
 from es_service.runs.export import export
-from es_service.runs.trackers import PACKAGES, TensorBoard, _key, check_trackers, fill, metrics, open_tracker
+from es_service.runs.tracking import PACKAGES, TensorBoard, _key, check_trackers, fill, metrics, open_tracker
 from es_service.store.codec import text_sha256
 from tests.database import execute
 from tests.run_examples import write_run
@@ -73,7 +73,7 @@ def test_a_session_without_a_generation_sends_what_is_lacking(folder):
 
 
 def test_a_long_history_is_sent_in_pieces(folder, monkeypatch):
-    monkeypatch.setattr("es_service.runs.trackers.MOST_ROWS", 4)
+    monkeypatch.setattr("es_service.runs.tracking.MOST_ROWS", 4)
     kept = []
     session(folder, lambda: Recorder(kept))
     assert kept == list(range(21))

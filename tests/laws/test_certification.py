@@ -25,7 +25,7 @@ from es_service.runs import certification
 from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, outputs_of
 from es_service.runs.certified import certified_policies
 from es_service.runs.evaluation import FRESH_GENERATION
-from es_service.runs.intervals import mean_interval, share_interval
+from es_service.runs.selection import mean_interval, share_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.store.writer import RunStore

@@ -47,7 +47,7 @@ JOINERS = {
     "es_service.environments.vector",
     "es_service.runs.engine",
     "es_service.runs.snapshot",
-    "es_service.runs.repeating",
+    "es_service.runs.verification",
     "es_service.runs.scaling",
     "es_service.runs.session",
     "es_service.config.tasks",

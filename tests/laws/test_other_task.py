@@ -32,11 +32,10 @@ from es_service.runs.certified import (
     certified_policies,
 )
 from es_service.runs.evaluation import evaluation_config
-from es_service.runs.intervals import gap_interval, mean_interval, share_gap_interval
 from es_service.runs.onnx import model_card
 from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
-from es_service.runs.selection import Episodes
+from es_service.runs.selection import Episodes, gap_interval, mean_interval, share_gap_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.watch.pages import draw_list, metrics

@@ -1,7 +1,7 @@
 """Trackers on the command line: a run that is resumed, and a tracker that fails."""
 
 from es_service import open_run
-from es_service.runs.trackers import TensorBoard
+from es_service.runs.tracking import TensorBoard
 from tests.es_service.test_trackers import events
 from tests.system.command_line import es
 
