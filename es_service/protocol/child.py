@@ -155,10 +155,21 @@ class Child:
             raise answer
         return answer
 
+    @property
+    def is_answered(self) -> bool:
+        """Whether `answer` would not wait."""
+        has_ended, poll = self._process.poll() is not None, select.poll()
+        poll.register(self.socket, select.POLLIN)
+        return bool(poll.poll(0)) or has_ended
+
     def call(self, *request: Any, limit_s: float | None = None) -> Any:
         """`ask`, and the `answer`."""
         self.ask(*request)
         return self.answer(limit_s)
+
+    def terminate(self) -> None:
+        """Ask it to end what it does, by SIGTERM."""
+        self._process.terminate()
 
     def kill(self) -> None:
         """Kill it and all that it has started; `end` waits for that."""

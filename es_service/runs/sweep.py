@@ -1,30 +1,31 @@
 """Sweeps: several runs of one config, each in a child process, so that one that fails does not touch the others.
 
-A child is `es-service run CONFIG --or-resume --out FOLDER`, or `es-service evaluate FOLDER --certify` where a run is to
-be certified. It is bound to this process: if the sweep is killed, so are its runs, and the same sweep again resumes
-each from its last finished generation.
+A child runs `es-service run CONFIG --or-resume --out FOLDER`, and `es-service evaluate FOLDER --certify` where a run is
+to be certified; then those of the next run, whose workers it has started already, unless one has failed. It is bound to
+this process: if the sweep is killed, so are its runs, and the same sweep again resumes each from its last finished
+generation.
 """
 
 from __future__ import annotations
 
 import os
-import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, Literal
+from typing import Literal
 
 from es_service.config.given import Overrides, Source
 from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
 from es_service.loop.budget import limits_of
 from es_service.loop.history import Row
-from es_service.protocol.child import require_same_process
+from es_service.protocol.child import Child, NoAnswerError, require_same_process
 from es_service.protocol.process_environment import same_imports
+from es_service.protocol.raised import RaisedError
 from es_service.protocol.system import given_path
 from es_service.runs.folders import INSIDE, write_groups
 from es_service.runs.session import OnNotice
@@ -36,6 +37,8 @@ from es_service.store.folder import explained
 from es_service.store.lock import acquire_lock
 
 _LOG = logger(__name__)
+COMMANDS = "es_service.cli.in_turn"
+"""Module of the processes."""
 POLL_S = 0.1
 ROWS_S = 1.0
 """Seconds between two readings of the newest generation of each run."""
@@ -141,20 +144,24 @@ def run_planned(
         if left:
             todo = f"{len(left)} of {counted(len(runs), 'run')} to do in {out}, {shares.at_once} at a time"
             on_notice(f"{todo}; workers of each: {' or '.join(dict.fromkeys(map(str, shares.workers)))}")
-        running: dict[str, _Child] = {}
+        running: dict[str, _Running] = {}
+        idle: list[Child] = []
         shown, read_s, maker = None, float("-inf"), os.getpid()
         try:
             while shown is None or waiting or running:
                 require_same_process(maker, "a sweep", "end this one: the sweep goes on in the other")
                 if (number := should_stop()) is not None:
                     raise Interrupted(number)
-                for name in [name for name, child in running.items() if child.process.poll() is not None]:
-                    child = running.pop(name)
-                    runs[name] = _ended(runs[name], child)
+                for name in [name for name, of in running.items() if of.has_ended()]:
+                    of = running.pop(name)
+                    runs[name] = _ended(runs[name], of)
+                    idle += [] if of.code else [of.process]  # what has failed may have left something behind
                     if runs[name].state == "waiting":
-                        _start(child.command, inside, runs, running)
+                        _start(of.command, inside, runs, running, idle)
                 while waiting and len(running) < shares.at_once:
-                    _start(waiting.popleft(), inside, runs, running)
+                    _start(waiting.popleft(), inside, runs, running, idle)
+                while idle:
+                    idle.pop().end()
                 if time.monotonic() - read_s > ROWS_S:
                     read_s = time.monotonic()
                     runs |= {name: replace(runs[name], row=newest(runs[name].folder)) for name in running}
@@ -169,71 +176,89 @@ def run_planned(
             with suppress(Exception):
                 on_progress(list(runs.values()))
             raise
+        finally:
+            for process in (*idle, *(of.process for of in running.values())):
+                process.end()
     return list(runs.values())
 
 
 @dataclass(eq=False)
-class _Child:
-    """The process of a run."""
+class _Running:
+    """A run whose command a process runs."""
 
     command: Command
-    process: subprocess.Popen[bytes]
-    log: IO[bytes]
-    """What it prints, after what earlier processes of the same run printed."""
+    process: Child
+    log: Path
+    """What its commands print, one after another."""
     begin: int
-    """Where in the log its own output begins."""
+    """Where in the log the output of this command begins."""
+    due: int
+    """Answers that its process has not given."""
+    code: int = 0
+    """Exit code of the command; 1 if its process has ended."""
+    how: str = ""
+    """How it has failed, in words."""
+
+    def has_ended(self) -> bool:
+        """Whether the command has ended."""
+        while self.due and self.process.is_answered:
+            self.due -= 1
+            try:
+                self.code = self.process.answer() or 0
+                self.how = f"it ended with exit code {self.code}"
+            except (NoAnswerError, RaisedError) as error:
+                self.due, self.code, self.how = 0, 1, f"it {error}" if isinstance(error, NoAnswerError) else str(error)
+        return not self.due
 
 
-def _start(command: Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Child]) -> None:
-    """Start the next process of a run; the run has failed if that is impossible."""
+def _start(
+    command: Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Running], idle: list[Child]
+) -> None:
+    """Start the next command of a run, in a process that has ended another one, or a new one; the run has failed if
+    that is impossible."""
     name, words = command.planned.name, command.next_words() or command.run
-    command.before = words
+    command.before, log, is_new = words, inside / f"{name}.log", not idle
     try:
-        with ExitStack() as opened:
-            log = opened.enter_context(open(inside / f"{name}.log", "ab+"))
-            begin = log.seek(0, os.SEEK_END)
-            process = subprocess.Popen(
-                words,
-                env=os.environ | same_imports(),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
-            )
-            opened.pop_all()
+        begin = log.stat().st_size if log.exists() else 0
+        process = Child(COMMANDS, os.environ | same_imports()) if is_new else idle.pop()
     except OSError as error:
         runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")
         return
-    running[name], runs[name] = _Child(command, process, log, begin), replace(runs[name], state="running")
+    if is_new:
+        process.ask("es-service")
+    process.ask(words, str(log))
+    running[name] = _Running(command, process, log, begin, 1 + is_new)
+    runs[name] = replace(runs[name], state="running")
 
 
-def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child]) -> None:
+def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Running]) -> None:
     """Ask all processes to end as Ctrl-C would, and wait for them. A second signal to this process ends it at once, and
     with it all that are bound to it."""
-    for child in running.values():
-        child.process.terminate()
-    for name, child in running.items():
-        child.process.wait()
-        ended = _ended(runs[name], child)
+    for of in running.values():
+        of.process.terminate()
+    for name, of in running.items():
+        while not of.has_ended():
+            time.sleep(POLL_S)
+        ended = _ended(runs[name], of)
         runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
 
 
-def _ended(run: SweptRun, child: _Child) -> SweptRun:
-    """A run after its process has ended; "waiting" if another one follows."""
-    code, row = child.process.returncode, newest(run.folder)
-    with child.log as log:
-        log.seek(max(child.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-        lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
-    if code == 0:
-        state, reason = end(run.folder, child.command.planned.config, row)
-        if child.command.next_words() not in ([], child.command.before):
+def _ended(run: SweptRun, of: _Running) -> SweptRun:
+    """A run after its command has ended; "waiting" if another one follows."""
+    row = newest(run.folder)
+    if not of.code:
+        state, reason = end(run.folder, of.command.planned.config, row)
+        if of.command.next_words() not in ([], of.command.before):
             return replace(run, state="waiting", row=row)
         return replace(run, state="finished" if state == "waiting" else state, row=row, reason=reason)
-    how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
+    lines = []
+    with suppress(OSError), of.log.open("rb") as log:
+        log.seek(max(of.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+        lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    last = f"{how}; its last line is: {lines[-1]}" if lines else how
+    last = f"{of.how}; its last line is: {lines[-1]}" if lines else of.how
     why = errors[-1] if errors else last
-    return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {log.name})")
+    return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {of.log})")
 
 
 def _at_first(planned: PlannedRun, certifying: Certifying | None) -> SweptRun:

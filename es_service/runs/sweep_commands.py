@@ -13,7 +13,6 @@ from es_service.config.model import RunConfig
 from es_service.errors import StoreError
 from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
-from es_service.protocol.child import bound
 from es_service.runs.certified import certified_over_time, target_reached
 from es_service.runs.run_status import recent_durations
 from es_service.runs.sweep_plan import PlannedRun
@@ -43,11 +42,11 @@ class Certifying:
 
 @dataclass
 class Command:
-    """What starts the processes of a run, one after another."""
+    """What a run of a sweep consists of, one command after another."""
 
     planned: PlannedRun
     run: list[str]
-    """Words that start it, or continue it."""
+    """Words of `es-service` that start it, or continue it."""
     certify: list[str]
     """Words that certify it."""
     certifying: Certifying | None
@@ -84,8 +83,8 @@ def command_of(
     share = [] if workers == "auto" else ["--workers", str(workers)]
     return Command(
         run,
-        bound("es_service", "run", str(file), "--or-resume", "--out", str(run.folder), *options),
-        bound("es_service", "evaluate", str(run.folder), "--certify", *share),
+        ["run", str(file), "--or-resume", "--out", str(run.folder), *options],
+        ["evaluate", str(run.folder), "--certify", *share],
         certifying,
     )
 
