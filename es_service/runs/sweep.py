@@ -23,7 +23,7 @@ from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreErr
 from es_service.logs import logger
 from es_service.loop.budget import limits_of
 from es_service.loop.history import Row
-from es_service.protocol.child import Child, NoAnswerError, require_same_process
+from es_service.protocol.child import END_S, Child, NoAnswerError, require_same_process
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.raised import RaisedError
 from es_service.protocol.system import given_path
@@ -161,7 +161,7 @@ def run_planned(
                 while waiting and len(running) < shares.at_once:
                     _start(waiting.popleft(), inside, runs, running, idle)
                 while idle:
-                    idle.pop().end()
+                    idle.pop().end(END_S)  # by itself, so that it closes what it has read
                 if time.monotonic() - read_s > ROWS_S:
                     read_s = time.monotonic()
                     runs |= {name: replace(runs[name], row=newest(runs[name].folder)) for name in running}
@@ -178,7 +178,7 @@ def run_planned(
             raise
         finally:
             for process in (*idle, *(of.process for of in running.values())):
-                process.end()
+                process.end(END_S)
     return list(runs.values())
 
 
@@ -219,7 +219,8 @@ def _start(
     name, words = command.planned.name, command.next_words() or command.run
     command.before, log, is_new = words, inside / f"{name}.log", not idle
     try:
-        begin = log.stat().st_size if log.exists() else 0
+        with log.open("ab") as file:
+            begin = file.tell()
         process = Child(COMMANDS, os.environ | same_imports()) if is_new else idle.pop()
     except OSError as error:
         runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")

@@ -58,7 +58,7 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
         wait_until(process, both_begun(out, NAMES[:2]))
         started = descendants(process.pid)
         process.kill()
-    assert len(started) == 6, "two runs, each with a worker and its guard"
+    assert len(started) == 8, "two runs and workers, each with its guard"
     end(started)
     before = {name: committed(out / name) or 0 for name in NAMES[:2]}
     ids = {name: open_run(out / name).run_id for name in NAMES[:2]}
