@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from es_service.protocol.noise import NORMAL_STD, normal_integers, uniforms
 from workers.environments.mujoco_parts import MjModel, MujocoState, mjx, mujoco
@@ -215,6 +216,36 @@ def _reacher(model: Simulated, *, reward_dist_weight: float = 1.0, reward_contro
     return Parts(start, observe, outcome, look)
 
 
+def _pusher(
+    model: Simulated,
+    *,
+    reward_near_weight: float = 0.5,
+    reward_dist_weight: float = 1.0,
+    reward_control_weight: float = 0.1,
+) -> Parts:
+    bodies = np.array([model.body(name) for name in ("tips_arm", "object", "goal")])
+
+    def start(key: Any) -> tuple[Any, Any]:
+        """The object is the first of so many in a rectangle that is far enough from the goal, as with Gymnasium, which
+        tries until it is: all are too near in one of 1e10 episodes."""
+        tries = 24
+        at = _uniforms(key, model.c.nv, 2 * tries).reshape(tries, 2) * jnp.array([0.3, 0.4]) - jnp.array([0.3, 0.2])
+        place = at[jnp.argmax(jnp.sum(at**2, axis=1) > 0.17**2)]
+        qvel = 0.005 * (2.0 * _uniforms(key, 0, model.c.nv) - 1.0)
+        return jnp.concatenate([model.mx.qpos0[:-4], place, jnp.zeros(2)]), qvel.at[-4:].set(0.0)
+
+    def observe(state: GymState) -> Any:
+        return jnp.concatenate([state.physics.qpos[:7], state.physics.qvel[:7], state.seen.ravel()])
+
+    def outcome(before: GymState, after: GymState, action: Any) -> tuple[Any, Any]:
+        tips, thing, goal = after.seen
+        near, far = (jnp.sqrt(jnp.sum((thing - other) ** 2)) for other in (tips, goal))
+        costs = reward_near_weight * near + reward_dist_weight * far + reward_control_weight * jnp.sum(action**2)
+        return -costs, jnp.bool_(False)
+
+    return Parts(start, observe, outcome, lambda data, stepped: data.xpos[bodies])
+
+
 def _inverted_pendulum(model: Simulated, *, reset_noise_scale: float = 0.01) -> Parts:
     def observe(state: GymState) -> Any:
         return jnp.concatenate(state.physics[:2])
@@ -324,6 +355,7 @@ TASKS = {
     "Walker2d-v5": GymTask("walker2d_v5.xml", 4, _walker2d),
     "Swimmer-v5": GymTask("swimmer.xml", 4, _swimmer),
     "Reacher-v5": GymTask("reacher.xml", 2, _reacher, 50),
+    "Pusher-v5": GymTask("pusher_v5.xml", 5, _pusher, 100),
     "InvertedPendulum-v5": GymTask("inverted_pendulum.xml", 2, _inverted_pendulum),
     "InvertedDoublePendulum-v5": GymTask("inverted_double_pendulum.xml", 5, _inverted_double_pendulum),
 }
@@ -332,6 +364,5 @@ _HUMANOID = "MJX has 138 places for its contacts, whose code takes minutes to co
 REFUSED = {
     "Humanoid-v5": _HUMANOID,
     "HumanoidStandup-v5": _HUMANOID,
-    "Pusher-v5": "MJX finds contacts of capsules with a cylinder otherwise than C MuJoCo",
 }
 """Environments of Gymnasium's MuJoCo that are none here -> the reason."""

@@ -3,8 +3,8 @@
 A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
 implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
 makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
-own and is used as it is, but for RK4, the contacts of capsules with planes, and which contacts are solved
-(`mujoco_contacts.py`).
+own and is used as it is, but for RK4, the contacts of capsules with planes and with cylinders
+(`mujoco_colliders.py`), and how contacts are solved (`mujoco_contacts.py`).
 
 Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
 (`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
@@ -13,7 +13,6 @@ be what simd cannot compile.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import importlib
 from collections.abc import Callable, Iterator, Mapping
@@ -26,13 +25,14 @@ import numpy as np
 
 from workers.environments import TaskError
 from workers.environments.brax_parts import Transform, quietly
+from workers.environments.mujoco_colliders import contacts_as_c
 from workers.environments.mujoco_contacts import AT_ONCE, solve
 from workers.viewer import Viewer
 
 mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains
 with quietly():
     from mujoco import mjx
-    from mujoco.mjx._src import collision_driver, collision_primitive, sensor, support, types
+    from mujoco.mjx._src import collision_driver, sensor, support, types
     from mujoco.mjx._src import forward as forward_of_mjx
 
 MjModel = Any
@@ -249,37 +249,6 @@ def mujoco_viewer(model: MjModel, mx: mjx.Model, step_s: float, physics: Callabl
         return Transform(data.xpos[1:], data.xquat[1:])
 
     return Viewer(model, poses, step_s)
-
-
-@collision_primitive.collider(ncon=2)
-def _plane_capsule(plane: Any, capsule: Any) -> tuple[Any, Any, Any]:
-    """Contacts of a plane with both ends of a capsule: distances, places and frames.
-
-    The first tangent of the frame, on which the pyramid of friction depends, is along the capsule, as in C MuJoCo.
-    MJX has another one for capsules that stand steeper than 60 degrees.
-    """
-    normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
-    flat = axis - normal * jnp.dot(normal, axis)
-    length = jnp.sqrt(jnp.sum(flat**2))
-    tangent = jnp.where(length > mujoco.mjMINVAL, flat / jnp.maximum(length, mujoco.mjMINVAL), jnp.eye(3)[0])
-    frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
-    ends = jnp.stack([capsule.pos + axis * capsule.size[1], capsule.pos - axis * capsule.size[1]])
-    distances = (ends - plane.pos) @ normal - capsule.size[0]
-    places = ends - normal * (capsule.size[0] + 0.5 * distances)[:, None]
-    return distances, places, jnp.stack([frame, frame])
-
-
-@contextlib.contextmanager
-def contacts_as_c(more: Mapping[Any, Any]) -> Iterator[None]:
-    """Context manager in which MJX is traced with the contacts of C MuJoCo, and with more functions for contacts."""
-    functions, plane = collision_driver._COLLISION_FUNC, (types.GeomType.PLANE, types.GeomType.CAPSULE)
-    with quietly():
-        before = dict(functions)
-        functions.update({plane: _plane_capsule, **more})
-        try:
-            yield
-        finally:
-            functions.update(before)
 
 
 def contact_forces(model: mjx.Model, data: Any) -> Any:
