@@ -23,6 +23,7 @@ from es_service.protocol.sources import sha256, user_sources
 from tests.mujoco_models import relative_error
 from workers.environments import TaskError, describe_environment, make_environment, make_host_task, mujoco_gym
 from workers.environments.mujoco_gym_tasks import REFUSED, TASKS, Feet
+from workers.environments.mujoco_parts import mujoco
 from workers.simd.episodes.kernel import compile_kernel
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")]
@@ -34,6 +35,8 @@ LONGEST = 60
 """Most steps with random actions after which a state is compared."""
 WALKERS = ("Ant", "HalfCheetah", "Hopper", "Walker2d")
 """Robots that have feet."""
+NAMED = {"Pusher-v5": 5e-3}
+"""Greatest error where C MuJoCo has two contacts instead of one: with a capsule that lies on a cylinder."""
 NOT_OURS = {"self", "xml_file", "default_camera_config", "frame_skip", "kwargs"}
 
 
@@ -55,8 +58,28 @@ def random_states(name: str, count: int) -> list[np.ndarray]:
         environment.reset(seed=seed)
         for _ in range(rng.integers(LONGEST)):
             environment.step(rng.uniform(space.low, space.high))
+        if name == "Pusher-v5":
+            reach_for_object(environment, rng)
         rows.append((environment.data.qpos.copy(), environment.data.qvel.copy(), rng.uniform(-1, 1, space.shape)))
     return [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+
+
+def reach_for_object(environment: Any, rng: np.random.Generator) -> None:
+    """Move the arm of Pusher, and the object to where its side touches a tip, with no contact deeper than 5 mm."""
+    model, data = environment.model, environment.data
+    (low, high), tip = model.jnt_range[:7].T, model.geom("tip_arml").id
+    thing = model.body("object").id
+    while True:
+        data.qpos[:7] = rng.uniform(low, high)
+        mujoco.mj_kinematics(model, data)
+        turn, away = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.055, 0.08)
+        x, y = data.geom_xpos[tip, :2] + away * np.array([np.cos(turn), np.sin(turn)])
+        data.qpos[-4:-2] += (y, x) - data.xpos[thing, 1::-1]
+        mujoco.mj_forward(model, data)
+        bodies = model.geom_bodyid[data.contact.geom]
+        upright = data.contact.frame[(bodies == thing).any(axis=1) & (bodies != 0).all(axis=1), 2]
+        if upright.size and np.abs(upright).max() < 0.5 and data.contact.dist.min() > -0.005:
+            return
 
 
 @pytest.mark.parametrize("name", sorted({*TASKS} - {"Reacher-v5", "Pusher-v5"}))
@@ -116,7 +139,10 @@ def steps_of_ours(name: str, given: list[np.ndarray], **options: Any) -> Steps:
 
 
 def compare(name: str, count: int) -> None:
-    """99 % of the errors, and the greatest, are at most TIMES what one ulp makes in Gymnasium, with its unit 1e-6."""
+    """99 % of the errors, and the greatest, are at most TIMES what one ulp makes in Gymnasium, with its unit 1e-6.
+
+    Where physics is known to differ, so are 90 %, and the greatest is at most that in NAMED.
+    """
     given, rng = random_states(name, count), np.random.default_rng(1)
     (truth, contacts), found, moved = steps_of_gymnasium(name, *given), steps_of_ours(name, given), []
     for _ in range(4):
@@ -130,7 +156,8 @@ def compare(name: str, count: int) -> None:
         error, *ulps = (relative_error(getattr(of, what).reshape(count, -1), right) for of in (found, *moved))
         ulp = np.maximum.reduce(ulps)
         print(what, *(f"{np.quantile(of, share):.1e}" for of in (error, ulp) for share in (0.5, 0.99, 1.0)))
-        for share in (0.99, 1.0):
+        assert error.max() <= NAMED.get(name, np.inf), what
+        for share in (0.9,) if name in NAMED else (0.99, 1.0):
             assert np.quantile(error, share) <= TIMES * (np.quantile(ulp, share) + 1e-6), (what, share)
     for what in ("done", "feet"):
         right = getattr(truth, what)

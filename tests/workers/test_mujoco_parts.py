@@ -201,3 +201,33 @@ def test_a_free_body_turns_with_rk4_as_in_c_mujoco():
     mujoco.mj_step(model, data)
     np.testing.assert_allclose(state.qpos, data.qpos, atol=1e-6)
     np.testing.assert_allclose(state.qvel, data.qvel, atol=1e-5)
+
+
+LYING = """<mujoco><default><geom margin=".004"/></default><worldbody>
+  <body><freejoint/><geom type="capsule" size=".02 .05"/></body>
+  <body><freejoint/><geom type="cylinder" size=".05 .05"/></body></worldbody></mujoco>"""
+
+
+def test_a_capsule_touches_a_cylinder_where_it_does_in_c_mujoco():
+    """But for capsules that lie on a flat end or along the side, for which C MuJoCo has two contacts."""
+    model, rng = mujoco.MjModel.from_xml_string(LYING), np.random.default_rng(0)
+    data, mx, rows, two = mujoco.MjData(model), mujoco_parts.put_model(model), [], 0
+    while len(rows) < 100:
+        turns = rng.normal(size=(2, 4))
+        turns /= np.linalg.norm(turns, axis=1)[:, None]
+        data.qpos[:] = [*rng.normal(0.0, 0.07, 3), *turns[0], 0.0, 0.0, 0.0, *turns[1]]
+        mujoco.mj_forward(model, data)
+        two += data.ncon == 2
+        if data.ncon == 1 and data.contact[0].dist > -0.01:
+            (contact,) = data.contact
+            rows.append((np.float32(data.qpos), contact.dist, contact.pos.copy(), contact.frame[:3].copy()))
+    assert 0 < two < 20
+
+    def touch(qpos: Any) -> tuple[Any, Any, Any]:
+        found: Any = mujoco_parts.forward(mx, mujoco_parts.start(mx, qpos), np.zeros(0))
+        contact = found._impl.contact
+        return contact.dist[0], contact.pos[0], contact.frame[0, 0]
+
+    qpos, *truth = (np.array(column) for column in zip(*rows, strict=True))
+    for of, to, within in zip(compile_kernel(touch, qpos[0])(qpos), truth, (1e-6, 1e-5, 1e-3), strict=True):
+        np.testing.assert_allclose(of, to, atol=within)

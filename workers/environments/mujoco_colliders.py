@@ -57,8 +57,8 @@ def _capsule_cylinder(capsule: Any, cylinder: Any) -> tuple[Any, Any, Any]:
     """The contact of a capsule and a cylinder where they are nearest: distance, place and frame.
 
     MJX looks for two by a few steps of gradient descent. The signed distance to a cylinder is convex, so along the axis
-    of a capsule its slope grows, and halving finds where it is 0. If the axis is inside of the cylinder, deeper than
-    the radius of the capsule, C MuJoCo may push out in another direction.
+    of a capsule its slope grows, and halving finds where it is 0. C MuJoCo has two contacts if the capsule lies on the
+    cylinder, and if the axis is inside of it may push out in another direction.
     """
     radius, half, axis = capsule.size[0], capsule.size[1], capsule.mat[:, 2]
     centre, along = cylinder.mat.T @ (capsule.pos - cylinder.pos), cylinder.mat.T @ axis

@@ -130,11 +130,10 @@ def step_and_look(
             number changes the speed, and results by rounding.
         contacts: functions that find contacts of two types of geoms, in place of those of MJX.
     """
-    empty = mjx.make_data(model)
     integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _single_stage
 
     def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
-        return integrate(model, _data(empty, before[0], ctrl), look, at_once), None
+        return integrate(model, _data(mjx.make_data(model), before[0], ctrl), look, at_once), None
 
     with contacts_as_c(contacts):
         first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
