@@ -30,7 +30,7 @@ ENVIRONMENTS = {
     ),
     "mujoco": ("mujoco==4.0.0 gymnasium==1.4.0 numpy==2.4.6 imageio==2.38.1 packaging==26.3",),
     "evosax": ("evosax==0.3.2 jax==0.10.2 jaxlib==0.10.2 numpy==2.4.6",),
-    "envpool": ("envpool==1.2.5 gymnasium==1.4.0 numpy==2.4.6",),
+    "envpool": ("envpool==1.2.0 gymnasium==1.4.0 numpy==2.4.6",),
 }
 """Folder of an environment -> packages of each call of pip, all calls but the first without dependencies.
 

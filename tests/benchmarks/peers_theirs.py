@@ -36,15 +36,17 @@ def versions(program: str, packages: Sequence[str]) -> dict[str, str]:
     return {package: metadata.version(package) for package in packages}
 
 
-def per_second(call: Callable[[], object], units: int, seconds: float) -> float:
+def per_second(
+    call: Callable[[], object], units: int, seconds: float, clock: Callable[[], float] = time.perf_counter
+) -> float:
     """Units per second of a call that makes so many, again and again for about `seconds`; the first call, which
     compiles, does not count."""
     call()
-    calls, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds or not calls:
+    calls, start = 0, clock()
+    while clock() - start < seconds or not calls:
         call()
         calls += 1
-    return calls * units / (time.perf_counter() - start)
+    return calls * units / (clock() - start)
 
 
 def _qdax_task(task: str, steps: int, hidden: int) -> tuple[Any, Any, Callable]:
@@ -182,11 +184,12 @@ ANT_STEP_S = 0.05
 """Seconds of a control step of `Ant-v5`: five of 0.01 s."""
 
 
-def _steps(envs: Any, count: int, seconds: float) -> float:
+def _steps(envs: Any, count: int, seconds: float, clock: Callable[[], float] = time.perf_counter) -> float:
     """Steps a second of `count` environments side by side, which reset themselves, with random actions drawn before."""
     import numpy as np
 
-    actions = np.random.default_rng(0).uniform(-1, 1, (20, count, 8)).astype(np.float32)
+    size = envs.action_space.shape[-1]
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, count, size)).astype(np.float32)
     envs.reset()
 
     def call() -> None:
@@ -207,14 +210,24 @@ def gymnasium_steps(mode: str, count: int, seconds: float) -> dict[str, Any]:
     return {"env_steps_per_second": rate, "simulated_s_per_second": rate * ANT_STEP_S, "settings": settings}
 
 
-def envpool_steps(cores: int, count: int, seconds: float) -> dict[str, Any]:
-    """Steps per second of EnvPool's ant with a thread per core, through gymnasium's interface."""
+def envpool_steps(
+    cores: int, count: int, seconds: float, task: str = ANT, of_processor: bool = False
+) -> dict[str, Any]:
+    """Steps per second of EnvPool's environments with a thread per core, through gymnasium's interface.
+
+    Args:
+        of_processor: whether seconds are those of the processor, of all threads, instead of the clock's.
+    """
     import envpool
 
-    envs = envpool.make(ANT, env_type="gymnasium", num_envs=count, num_threads=cores)
-    rate = _steps(envs, count, seconds)
-    settings = f"{ANT}, {cores} threads, {count} environments"
-    return {"env_steps_per_second": rate, "simulated_s_per_second": rate * ANT_STEP_S, "settings": settings}
+    envs = envpool.make(task, env_type="gymnasium", num_envs=count, num_threads=cores)
+    rate = _steps(envs, count, seconds, time.process_time if of_processor else time.perf_counter)
+    settings = f"{task}, {cores} threads, {count} environments"
+    return {
+        "env_steps_per_second": rate,
+        "simulated_s_per_second": rate * ANT_STEP_S if task == ANT else None,
+        "settings": settings,
+    }
 
 
 def evosax_es(pairs: int, parameters: int, generations: int) -> dict[str, Any]:
