@@ -211,7 +211,8 @@ def test_a_task_says_its_sizes_and_options():
     )
     assert more.observation_size == 18
     assert tuple(describe_environment("mujoco:Swimmer-v5").descriptors) == ("final_xy", "final_x", "final_joints")
-    assert tuple(describe_environment("mujoco:Reacher-v5").descriptors) == ("final_joints",)
+    for name in ("Reacher-v5", "Pusher-v5"):
+        assert tuple(describe_environment(f"mujoco:{name}").descriptors) == ("final_joints",)
     of_ant = mujoco_gym._descriptors(mujoco_gym.load(TASKS["Ant-v5"]))
     assert tuple(of_ant) == ("final_xy", "final_x", "feet_contact", "final_joints")
     assert of_ant["feet_contact"][:2] == (("foot_1", "foot_2", "foot_3", "foot_4"), ((0.0, 1.0),) * 4)

@@ -214,7 +214,7 @@ def _descriptors(model: MjModel) -> dict[str, tuple[tuple[str, ...], Bounds, Any
     for kind, axes in (("final_xy", "xy"), ("final_x", "x")):
         if along[: len(axes)] == axes:
             descriptors[kind] = tuple(axes), ((-FAR, FAR),) * len(axes), np.arange(len(axes))
-    if feet := len(feet_of(model)):
+    if root and (feet := len(feet_of(model))):  # what stands on a table is no foot
         descriptors[FEET] = tuple(f"foot_{number}" for number in range(1, feet + 1)), ((0.0, 1.0),) * feet, None
     if joints := min(JOINTS, model.nq - root):
         names = tuple(f"joint_{number}" for number in range(1, joints + 1))
