@@ -191,7 +191,7 @@ def test_options_have_the_names_and_defaults_of_gymnasium(name: str):
 def test_resets_have_gymnasiums_distributions(name: str):
     """The range, the mean and the spread of each number of an observation, in as many resets of both."""
     environment, theirs = make_environment(f"mujoco:{name}", {}), gymnasium.make(name).unwrapped
-    observed = compile_kernel(lambda key: environment.observe(environment.reset(key)), KEYS[0])(KEYS)
+    observed = compile_kernel(lambda key: environment.observe(environment.reset(key)), KEYS[0])(KEYS).astype(float)
     gyms = np.array([theirs.reset(seed=seed)[0] for seed in range(len(KEYS))])
     assert observed.shape == gyms.shape
     spread = gyms.std(0)
