@@ -19,7 +19,7 @@ from es_service.errors import ConfigError
 from es_service.report import statistics
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
-from es_service.report.measures import CERTIFIED, GAP, SUCCESS, measures
+from es_service.report.measures import CERTIFIED, GAP, SUCCESS, has_curve, measures
 from es_service.report.series import X_AXES, Chart, Line, axes_of
 from es_service.runs.setting_words import settings_words
 from es_service.runs.sweep_plan import ENVIRONMENT
@@ -265,7 +265,7 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
     x_K = places(groups, axis)
     chart_list = []
     for column, measure in measures(runs_of(groups)).items():
-        if column == GAP:
+        if not has_curve(runs_of(groups), column):
             continue
         lines = []
         for group in groups:

@@ -14,7 +14,7 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
-from es_service.report.measures import GAP, chosen
+from es_service.report.measures import chosen, has_curve
 from es_service.report.overview import draw_overview
 from es_service.report.several_maps import over_seeds
 
@@ -62,7 +62,7 @@ def write_figures(
     """
     drawings: dict[str, Callable[[Any], Any]] = {}
     for column in chosen(runs, metrics):
-        if column != GAP or metrics:
+        if has_curve(runs, column):
             drawings[column] = lambda figure, column=column: plots.curves(
                 list(runs), figure.subplots(), column, group_by=keys
             )

@@ -110,6 +110,13 @@ def chosen(runs: Sequence[RunData], names: Sequence[str]) -> dict[str, Measure]:
     return {name: found[name] for name in names} or found
 
 
+def has_curve(runs: Sequence[RunData], column: str) -> bool:
+    """Whether a measure of runs is drawn as a curve: certified values only if they were certified before their ends."""
+    if column == GAP or column.startswith(CERTIFIED):
+        return column != GAP and all(np.isfinite(run.history[column][:-1]).any() for run in runs)
+    return True
+
+
 def has_values(run: RunData, column: str) -> bool:
     """Whether a run has a number in a column."""
     return bool(np.isfinite(run.history.get(column, np.zeros(0))).any())

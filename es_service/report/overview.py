@@ -11,7 +11,7 @@ from es_service.errors import counted
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
-from es_service.report.measures import CERTIFIED
+from es_service.report.measures import CERTIFIED, has_curve, measures
 
 PANELS_IN_A_ROW = 6
 PANEL_SIZE = 1.7
@@ -38,7 +38,7 @@ def draw_overview(
     """
     threshold = compare.common_threshold(runs) if threshold is None else threshold
     summaries = compare.summaries(compare.grouped(runs, keys), threshold)
-    columns = [column for column in CURVES if all(column in run.history for run in runs)]
+    columns = [column for column in CURVES if column in measures(runs) and has_curve(runs, column)]
     wide = max(FEWEST_COLUMNS, min(PANELS_IN_A_ROW, len(summaries)))
     rows = -(-len(summaries) // wide)
     figure.set_size_inches(wide * PANEL_SIZE, rows * (PANEL_SIZE + 0.5) + CURVES_HEIGHT)

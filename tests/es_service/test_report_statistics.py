@@ -240,6 +240,10 @@ def test_groups_are_judged_by_certified_values_if_all_have_one(runs):
     measures = between.compared(groups)
     assert [measure.name for measure in measures][:2] == ["certified", "best_fitness"]
     assert measures[0].pairs[0].difference.improvement == 1.0
+    titles = [chart.title for chart in compare.charts(groups, "env_steps")[0]]
+    assert titles[0] == "Best fitness so far"  # a curve of values at the ends alone would be empty
+    earlier = [certified(run, (3000, -99.0, None), (end, -90.0, None)) for run in runs]
+    assert compare.charts(compare.grouped(earlier), "env_steps")[0][0].title == "Certified value"
     one_left = [*all_certified[:-1], runs[-1]]
     assert [group.name for group in compare.grouped(one_left)] == ["es", "me_es"]
     assert "highest median of the best fitness" in words(comparison_page(one_left))
