@@ -15,7 +15,7 @@ from typing import Any
 
 from es_service.protocol.system import architecture, processor_fields
 
-VERSION = "0.26.0"
+VERSION = "0.27.0"
 """Version of es-service, written here because the metadata of an editable installation keep the version of the last
 `pip install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
