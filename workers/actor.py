@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import socket
 from contextlib import suppress
 from pathlib import Path
@@ -145,12 +146,14 @@ def remove_old_logs(own: Path) -> None:
     Ray never does, and a run whose workers are replaced may go on for weeks.
 
     Args:
-        own: the file with what this worker prints, named by Ray `worker-WORKER-JOB-PROCESS.out`.
+        own: where this worker prints: a file named by Ray `worker-WORKER-JOB-PROCESS.out`, else nothing is removed.
     """
-    *_, job, _ = own.stem.split("-")
+    named = re.fullmatch(r"worker-\w+-(\w+)-\d+\.out", own.name)
+    if named is None:
+        return
     logs = [
         log
-        for log in own.parent.glob(f"worker-*-{job}-*.out")
+        for log in own.parent.glob(f"worker-*-{named[1]}-*.out")
         if not Path("/proc", log.stem.rpartition("-")[2]).exists()
     ]
     for log in sorted(logs, key=lambda log: log.stat().st_mtime)[:-KEPT_LOGS]:
