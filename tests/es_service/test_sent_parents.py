@@ -35,6 +35,7 @@ from workers import process
 from workers.actor import WorkerActor
 from workers.compilable import Compilable
 from workers.parents import Parents
+from workers.reports import Reports
 
 PARENTS, WORKERS = 60, 2
 FAILING = 9
@@ -90,7 +91,7 @@ class Threads(inline_module.ChildProcesses):
         ours, theirs = socket_pair()
         computing: Future[Any] = Future()
         computing.set_result(process.Made(COMPUTING, set()))
-        given = theirs.detach(), computing, self.theirs
+        given = theirs.detach(), computing, self.theirs, Reports(self.theirs)
         threading.Thread(target=process._work, args=given, daemon=True).start()
         self._add(worker, child, ours)
         self._ready.append(Placed(worker))
@@ -112,6 +113,7 @@ class ActorsHere(PretendedRay):
         found, actor = super()._start(spec, index, gpus, cores), WorkerActor(spec, index)
         actor._run_chunks = COMPUTING
         actor._parents = Parents(self.theirs, Recipes.made)
+        actor._reports = Reports(spec())
 
         def remote(name: str) -> SimpleNamespace:
             def body(*parts: Any) -> Any:
