@@ -40,7 +40,7 @@ from workers.reports import Reports
 PARENTS, WORKERS = 60, 2
 FAILING = 9
 """Number of an ask whose chunks raise an exception."""
-LIMITS = Limits(workers=WORKERS, max_attempts=1)
+LIMITS, SPEC = Limits(workers=WORKERS, max_attempts=1), spec()
 
 
 def made(work: Sequence[Work]) -> list[Any]:
@@ -113,7 +113,7 @@ class ActorsHere(PretendedRay):
         found, actor = super()._start(spec, index, gpus, cores), WorkerActor(spec, index)
         actor._run_chunks = COMPUTING
         actor._parents = Parents(self.theirs, Recipes.made)
-        actor._reports = Reports(spec())
+        actor._reports = Reports(SPEC)
 
         def remote(name: str) -> SimpleNamespace:
             def body(*parts: Any) -> Any:
