@@ -101,7 +101,7 @@ if __name__ == "__main__":
         time.sleep(0.1)
         assert actor.progress() == hangs, "it waits"
         second = calls.submit(actor.run, *item(-1.0))
-        fitness = [pickle.loads(call.result())[0].fitness for call in (first, second)]
+        fitness = [pickle.loads(call.result())[0][0].fitness for call in (first, second)]
     assert actor.progress() != hangs
     assert np.array_equal(fitness, np.full_like(fitness, 1.0) * [[1.0], [-1.0]]), fitness
 """
