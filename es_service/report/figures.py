@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -129,8 +130,9 @@ def _grid(
     for axes, (name, run) in zip(panels, shown, strict=False):
         drawn = plots.behaviour_map(run, axes, colours)
         axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        # A name may contain a $.
-        axes.set_title(name, parse_math=False, fontsize=8 if len(shown) <= FEW else 5, wrap=True)
+        # A name may contain a $, which matplotlib takes for a formula where it wraps lines itself.
+        size, letters = (8, 38) if len(shown) <= FEW else (5, 26)
+        axes.set_title(textwrap.fill(name, letters), parse_math=False, fontsize=size)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     figure.colorbar(drawn, ax=panels, label=label, aspect=30, fraction=0.03, pad=0.02)
