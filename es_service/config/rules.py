@@ -36,7 +36,7 @@ MOST_PLACING_S = 600.0
 """Longest estimated time of that, in seconds."""
 MOST_PARAMETERS = 80_000_000
 """The store keeps a centre and Adam's two moments, 12 bytes per parameter, in one value; SQLite allows 1e9 bytes."""
-MOST_DESCRIPTOR_DIMENSIONS = 974
+MOST_DESCRIPTOR_DIMENSIONS = 973
 """The history has two columns for each dimension and up to 51 others, and a table of SQLite 2,000 columns."""
 MOST_CHUNK_PAIRS = CHUNK_PAIRS[1]
 PLACED = ("target", "nearness")

@@ -139,7 +139,7 @@ def test_halves_of_one_pair_are_refused(overrides):
         ("task.option=5", "unknown key; task has options, environment, episode_steps, fitness, episodes_per_member"),
         ("task.options.start.x=3", "task.options.start.x: unknown key"),
         ("qqq.zzz=3", "unknown key; the sections are task, policy, search, novelty, map, budget, compute"),
-        ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, target_fitness"),
+        ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, rollout_s, cpu_s, target_fitness"),
         ("search.sigma", "override search.sigma: write KEY=VALUE, such as search.sigma=0.05"),
         ("=3", "override =3: write KEY=VALUE"),
         ("search.init_from=", "override search.init_from=: the value is missing; write null"),
@@ -327,20 +327,20 @@ def test_what_would_take_too_long_or_be_too_wide_is_refused_with_the_number():
         return []
 
     assert found(1000, "map.enabled=false") == [
-        "task.environment: the descriptor of point_maze has 1,000 dimensions; a run can store at most 974, since its "
+        "task.environment: the descriptor of point_maze has 1,000 dimensions; a run can store at most 973, since its "
         "history has two columns for each"
     ]
     assert (
-        found(974, "map.enabled=false")
-        == found(974, "map.kind=cvt")
+        found(973, "map.enabled=false")
+        == found(973, "map.kind=cvt")
         == found(7, "map.cells=[4096]", "map.kind=cvt")
         == []
     )
-    assert found(974, "map.cells=[4096]") == [
-        "map.cells: placing 4,096 centroids in 974 dimensions would take about 1799 s; must be at most 2,365, or "
+    assert found(973, "map.cells=[4096]") == [
+        "map.cells: placing 4,096 centroids in 973 dimensions would take about 1797 s; must be at most 2,366, or "
         "map.centroids = kmeans, which is faster"
     ]
-    assert found(974, "map.cells=[2365]") == found(974, "map.cells=[4096]", "map.centroids=kmeans") == []
+    assert found(973, "map.cells=[2366]") == found(973, "map.cells=[4096]", "map.centroids=kmeans") == []
     assert found(100, "map.centroids=kmeans", "map.kind=grid", "map.cells=[2]")[-1].startswith(
         "map.centroids: kmeans has"
     )

@@ -72,7 +72,7 @@ def test_a_new_worker_takes_the_place_of_one_that_was_lost(monkeypatch):
 
         def gpus_of_workers():
             engine.evaluate(work)
-            return sorted(worker.child.place for worker in engine.transport._workers.values())
+            return sorted(worker.place for worker in engine.transport._workers.values())
 
         assert gpus_of_workers() == ["5", "5", "8", "8"]
         first = min(engine.transport.process_ids())

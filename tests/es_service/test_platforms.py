@@ -71,7 +71,7 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
             return super().evaluate(work)
 
     @contextmanager
-    def engine(config, should_stop, *_):
+    def engine(config, should_stop, *_, **__):
         yield Cluster(make_worker(worker_spec(config, task_of(config))), should_stop)
 
     monkeypatch.setattr(session, "make_engine", engine)

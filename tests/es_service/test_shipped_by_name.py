@@ -76,7 +76,7 @@ def test_every_package_is_installed():
         for root in ("es_service", "workers")
         for path in (ROOT / root).rglob("__init__.py")
     }
-    assert set(packages) == found | {"es_service.shipped_configs"}
+    assert set(packages) == found | {"es_service.shipped_configs", "es_service.launch_files"}
     assert len(packages) == len(set(packages))
 
 

@@ -83,10 +83,10 @@ def _from_cylinder(point: Any, size: Any) -> tuple[Any, Any]:
     Args:
         size: radius and half the length of the cylinder.
     """
-    around = jnp.sqrt(jnp.sum(point[:2] ** 2))
-    radial = jnp.where(around > SHORTEST, jnp.append(point[:2] / jnp.maximum(around, SHORTEST), 0.0), jnp.eye(3)[0])
+    away = jnp.sqrt(jnp.sum(point[:2] ** 2))
+    radial = jnp.where(away > SHORTEST, jnp.append(point[:2] / jnp.maximum(away, SHORTEST), 0.0), jnp.eye(3)[0])
     axial = jnp.where(point[2] < 0.0, -1.0, 1.0) * jnp.eye(3)[2]
-    beside, beyond = around - size[0], jnp.abs(point[2]) - size[1]
+    beside, beyond = away - size[0], jnp.abs(point[2]) - size[1]
     corner = jnp.sqrt(beside**2 + beyond**2)
     is_corner = (beside > 0.0) & (beyond > 0.0)
     from_corner = (beside * radial + beyond * axial) / jnp.maximum(corner, SHORTEST)
