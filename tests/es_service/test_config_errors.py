@@ -139,7 +139,7 @@ def test_halves_of_one_pair_are_refused(overrides):
         ("task.option=5", "unknown key; task has options, environment, episode_steps, fitness, episodes_per_member"),
         ("task.options.start.x=3", "task.options.start.x: unknown key"),
         ("qqq.zzz=3", "unknown key; the sections are task, policy, search, novelty, map, budget, compute"),
-        ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, rollout_s, cpu_s, target_fitness"),
+        ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, rollout_s, cpu_s, target_"),
         ("search.sigma", "override search.sigma: write KEY=VALUE, such as search.sigma=0.05"),
         ("=3", "override =3: write KEY=VALUE"),
         ("search.init_from=", "override search.init_from=: the value is missing; write null"),

@@ -11,7 +11,7 @@ import pytest
 from es_service import open_run, plots
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.options import choice
-from es_service.report import compare, several_maps
+from es_service.report import compare, figures, several_maps
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
 from es_service.report.facts import number
@@ -357,8 +357,9 @@ def test_all_text_of_a_user_is_escaped(tmp_path):
 
 
 @pytest.mark.slow
-def test_names_are_no_formulas_in_figures(tmp_path):
+def test_names_are_no_formulas_in_figures(tmp_path, monkeypatch):
     """matplotlib reads what is between two $ as a formula, and refuses one that is wrong."""
+    monkeypatch.setattr(figures, "KINDS", ("svg",))
     runs = [read_run(folder) for folder in named_runs(tmp_path, r"$\frac$", r"v$\frac$")]
     assert write_figures(runs[:1], tmp_path / "one")
     assert write_figures(runs, tmp_path / "two", ["task.options.way"])

@@ -192,6 +192,7 @@ TOP = """<mujoco><option timestep="0.05" gravity="0 0 0" integrator="RK4"/><worl
   <body><freejoint/><geom type="box" size=".1 .2 .3" mass="1"/></body></worldbody></mujoco>"""
 
 
+@pytest.mark.long
 def test_a_free_body_turns_with_rk4_as_in_c_mujoco():
     """Without the rates of its rotation vector, the quaternion is wrong by 3e-4."""
     model = mujoco.MjModel.from_xml_string(TOP)

@@ -262,7 +262,7 @@ def test_the_arm_of_the_examples_reaches_its_target_in_its_model():
     assert "tests/examples/reaching_arm.xml" in user_sources(ARM)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("one_process")
 def test_a_short_training_of_the_arm_is_certified_to_be_better_than_a_random_policy(tmp_path):
     """Whole intervals of 95 % apart; and the policies move the hand to different places."""
