@@ -153,7 +153,7 @@ class Mirror:
 
         ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]
         answer = os.getpid(), ids, worker_environment(os.environ, self.gpus)
-        return pickle.dumps([answer for _ in pickle.loads(chunks)[1]])
+        return pickle.dumps(([answer for _ in pickle.loads(chunks)[1]], None))
 
 
 def mirrored(workers: int, gpus: float = 0.0) -> list[tuple[int, list[str], dict[str, str]]]:
