@@ -138,7 +138,9 @@ def example(task: str, integrator: str = "RK4") -> Example:
 
     def states_of(count: int, seed: int) -> MujocoState:
         qpos, qvel, _ = states(task, count, seed)
-        return MujocoState(qpos, qvel, np.zeros((count, 0)), np.zeros_like(qvel), np.zeros(count, np.float32))
+        return MujocoState(
+            qpos, qvel, np.zeros((count, 0), np.float32), np.zeros_like(qvel), np.zeros(count, np.float32)
+        )
 
     return Example(of_c, SUBSTEPS, "", of_mjx, wall_contacts(box_W_4), states_of, task)
 

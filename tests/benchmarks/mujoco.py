@@ -278,7 +278,8 @@ def table(of: Path) -> str:
     def times(row: Any, side: str) -> str:
         if np.isnan(row.get(f"times_{side}", np.nan)):
             return "-"
-        return "{:.1f} ({:.1f} to {:.1f})".format(*(row[f"{part}_{side}"] for part in ("times", "least", "most")))
+        values = (row[f"{part}_{side}"] for part in ("times", "least", "most"))
+        return "{} ({} to {})".format(*(f"{value:,.0f}" if value >= 1000 else f"{value:.3g}" for value in values))
 
     for row in rows_of.to_dict("records"):
         name = f"{row['row']}{', all pairs' if row['all_pairs'] else ''}, {row['cores']}"
