@@ -17,8 +17,17 @@ PACKAGE = Path(__file__).parents[1]
 CLONE = PACKAGE.parent
 GUIDES = {
     "using": (PACKAGE / "guides" / "using.md",),
-    "configs": (CLONE / "configs" / "README.md", PACKAGE / "shipped_configs" / "README.md"),
-    "qdax": tuple(folder / "qdax_and_pyribs.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs")),
+    **{
+        name: tuple(folder / f"{file}.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs"))
+        for name, file in {
+            "configs": "README",
+            "methods": "methods",
+            "keys": "keys",
+            "sweeps": "sweeps",
+            "own_searches": "own_searches",
+            "other_libraries": "other_libraries",
+        }.items()
+    },
     "workers": (CLONE / "workers" / "README.md",),
     "docker": (CLONE / "docker" / "README.md", PACKAGE / "launch_files" / "README.md"),
     "es_service": (PACKAGE / "README.md",),

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,11 +20,11 @@ from es_service.cli.options import JsonOption, RunsArgument, is_single, of_each,
 from es_service.cli.printing import command, console, print_json, print_line, print_note
 from es_service.cli.status import follow_status, print_status
 from es_service.config.given import first_sentence, shipped_configs, shipped_text
-from es_service.config.keys import unknown_key
+from es_service.config.keys import SECTIONS, unknown_key
 from es_service.config.search import PRESETS, preset_table
 from es_service.config.tasks import TASKS
-from es_service.config.text import one_of, show
-from es_service.config.values import described_keys
+from es_service.config.text import show
+from es_service.config.values import DescribedKey, described_keys, methods_words
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
@@ -165,12 +165,13 @@ def config_(
         str, typer.Argument(help="Name of a shipped config, as `list` shows it; with --keys, a key or section.")
     ] = "",
     keys: Annotated[bool, typer.Option("--keys", help="Describe the keys of configs instead.")] = False,
+    as_page: Annotated[bool, typer.Option("--markdown", help="With --keys, print a page of Markdown.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print a shipped config, which you can save as a file and edit, or what keys mean."""
     if not keys:
-        if as_json:
-            raise ConfigError("--json is for --keys; a shipped config is YAML already")
+        if as_json or as_page:
+            raise ConfigError("--json and --markdown are for --keys; a shipped config is YAML already")
         print(shipped_text(name), end="")
         return
     everything = described_keys(OURS)
@@ -181,13 +182,41 @@ def config_(
     if as_json:
         print_json([row._asdict() for row in rows])
         return
+    if as_page:
+        print(keys_page(rows), end="")
+        return
     for row in rows:
         print_line(console, f"{row.key} = {row.default}", style="bold")
-        others, of_methods = [method for method in OURS if method not in row.methods], ""
-        if others and row.methods:
-            which = f"all but {one_of(others, 'and')}" if len(others) < len(row.methods) else one_of(row.methods, "and")
-            of_methods = f" A key of {which}."
+        of_methods = f" A key of {words}." if (words := methods_words(row.methods, OURS)) else ""
         console.print(Padding(f"{row.meaning} Must be {row.allowed}.{of_methods}", (0, 0, 0, 4)))
+
+
+PAGE_OF_KEYS = """\
+# Every key of a config
+
+This page is the output of `es-service config --keys --markdown`, which reads the descriptions of the keys in the code.
+`es-service config --keys search.step` shows a part of it.
+
+The default is in parentheses. A key whose default is `required` must be set. A default with a slash depends on
+`search.preset`: the first value is that of `literature`, the second that of `uber`. Some methods have other defaults.
+"""
+
+
+def keys_page(rows: Iterable[DescribedKey]) -> str:
+    """A page of Markdown: what the class of each section says, and a line for each key, by the methods that have it."""
+    grouped: dict[str, dict[tuple[str, ...], list[DescribedKey]]] = {}
+    for row in rows:
+        grouped.setdefault(row.key.split(".")[0], {}).setdefault(row.methods, []).append(row)
+    parts = [PAGE_OF_KEYS]
+    for section, by_methods in grouped.items():
+        about = [f"{SECTIONS[section].__doc__}\n"] if section in SECTIONS else []
+        parts += [f"## {section}\n", *about]
+        for methods, group in by_methods.items():
+            words = methods_words(methods, OURS)
+            heading = [f"### {section}: keys of {words}\n"] if words else []
+            lines = [f"- **`{row.key}`** ({row.default}): {row.meaning} *Must be {row.allowed}.*\n" for row in group]
+            parts += [*heading, "".join(lines)]
+    return "\n".join(parts)
 
 
 def list_(as_json: JsonOption = False) -> None:

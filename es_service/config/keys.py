@@ -13,9 +13,10 @@ from typing import Any, Literal, Protocol, get_args
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
 
-from es_service.config.model import RunConfig, WorkerResources
+from es_service.config.model import RunConfig
 from es_service.config.parts import RESOURCES, TASK_OPTIONS, Section
 from es_service.config.search import SearchConfig
+from es_service.config.sections import WorkerResources
 from es_service.config.text import nearest, one_of, problem_of, show
 from es_service.errors import Problem
 

@@ -94,13 +94,14 @@ class AdamStep(Section):
     kind: Literal["adam"] = "adam"
     learning_rate: Positive = Field(
         0.01,
-        description="Length of a step. adam, adamw: about how far each parameter moves in a generation, in parameter "
-        "units. plain: factor of the gradient estimate. clipup: length that a step adds to the velocity.",
+        description="Length of a step. `adam`, `adamw`: about how far each parameter moves in a generation, in "
+        "parameter units. `plain`: factor of the gradient estimate. `clipup`: length that a step adds to the "
+        "velocity.",
     )
     l2: NotNegative = Field(
         0.005,
-        description="Weight decay, added to the gradient before the step: lambda in -g + lambda x. adamw: the share of "
-        "a centre, times learning_rate, that each step takes away.",
+        description="Weight decay, added to the gradient before the step: lambda in -g + lambda x. `adamw`: the "
+        "share of a centre, times `learning_rate`, that each step takes away.",
     )
 
 
@@ -128,9 +129,9 @@ class ClipUpStep(Section):
     l2: NotNegative = Field(0.005, description="Weight decay, as for adam.")
     max_speed: Positive | None = Field(
         None,
-        description="Of kind clipup: greatest length of a step, in parameter units; null: learning_rate / 0.75.",
+        description="Of kind `clipup`: greatest length of a step, in parameter units; `null`: `learning_rate` / 0.75.",
     )
-    momentum: Fraction = Field(0.9, description="Of kind clipup: share of the velocity that a step keeps.")
+    momentum: Fraction = Field(0.9, description="Of kind `clipup`: share of the velocity that a step keeps.")
 
 
 class FullNoise(Section):
@@ -146,7 +147,7 @@ class LowRankNoise(Section):
     """Each weight matrix moves along a product of two thin matrices of normal numbers."""
 
     kind: Literal["low_rank"] = "low_rank"
-    rank: Rank = Field(1, description="Of kind low_rank: columns of the thin matrices.")
+    rank: Rank = Field(1, description="Of kind `low_rank`: columns of the thin matrices.")
 
 
 class Ranks(Section):
@@ -173,8 +174,8 @@ class TopPairs(Section):
     kind: Literal["top_pairs"] = "top_pairs"
     count: Count | None = Field(
         None,
-        description="Of kind top_pairs: number of pairs from which a step is computed, those with the highest value of "
-        "their better member; null: all pairs.",
+        description="Of kind `top_pairs`: number of pairs from which a step is computed, those with the highest "
+        "value of their better member; `null`: all pairs.",
     )
 
 
@@ -222,8 +223,8 @@ class MixtureObjective(ObjectivePart):
     kind: Literal["mixture"] = "mixture"
     weight: Fraction = Field(
         0.5,
-        description="Of kind mixture: weight of fitness beside novelty; of kind nearness: weight of nearness beside "
-        "fitness.",
+        description="Of kind `mixture`: weight of fitness beside novelty; of kind `nearness`: weight of nearness "
+        "beside fitness.",
     )
 
 
@@ -233,10 +234,10 @@ class TargetObjective(ObjectivePart):
     kind: Literal["target"] = "target"
     descriptor: Point = Field(
         (),
-        description="Of kind target: middle of the set; of kind nearness: the descriptor to be near to; one number for "
-        "each dimension.",
+        description="Of kind `target`: middle of the set; of kind `nearness`: the descriptor to be near to; one "
+        "number for each dimension.",
     )
-    radius: Positive = Field(1.0, description="Of kind target: greatest distance from the middle inside of the set.")
+    radius: Positive = Field(1.0, description="Of kind `target`: greatest distance from the middle inside of the set.")
 
 
 class NearnessObjective(ObjectivePart):
@@ -264,32 +265,35 @@ class Measured(Section):
 
     depth: Count = Field(
         8,
-        description="Policies that a cell keeps; the fittest is its elite. Kind once has no such keys.",
+        description="Policies that a cell keeps; the fittest is its elite. Kind `once` has no such keys.",
     )
     again: Again = Field(
         0.25,
-        description="Share of a generation's episodes that measure kept policies again; all: every kept policy once in "
-        "each generation, besides the other episodes.",
+        description="Share of a generation's episodes that measure kept policies again; `all`: every kept policy "
+        "once in each generation, besides the other episodes.",
     )
     draw: Literal["exponential", "linear", "harmonic", "uniform"] = Field(
         "exponential",
         description="How these policies are drawn, by their rank in their cell, 0 for the fittest: in proportion to "
-        "exp(-rank), to the deepest rank + 1 - rank, to 1 / (rank + 1), or all alike.",
+        "exp(-rank) (`exponential`), to the deepest rank + 1 - rank (`linear`), to 1 / (rank + 1) (`harmonic`), or "
+        "all alike (`uniform`).",
     )
     estimate: Literal["mean", "median"] = Field(
-        "mean", description="What of its samples says the fitness and the descriptor of a policy."
+        "mean",
+        description="What of its samples says the fitness and the descriptor of a policy: their `mean`, or their "
+        "`median`.",
     )
 
 
 class MeasuredNewcomers(Measured):
     """The same for a search whose newcomers may be measured several times before they are compared."""
 
-    first_samples: Count = Field(2, description="Episodes, or means of evaluation episodes, of each new policy.")
+    first_samples: Count = Field(2, description="Samples of each new policy before it is compared.")
     replaces: Literal["worst", "any"] = Field(
         "worst",
-        description="What a new policy replaces in a full cell. worst: the least fit, if that is less fit. any: a "
-        "random one, whatever its fitness; parents are then drawn from all policies of a cell, in proportion to their "
-        "fitness above the lowest.",
+        description="What a new policy replaces in a full cell. `worst`: the least fit, if that is less fit. `any`: "
+        "a random one, whatever its fitness; parents are then drawn from all policies of a cell, in proportion to "
+        "their fitness above the lowest.",
     )
 
 

@@ -84,33 +84,33 @@ def preset_table(algorithms: Mapping[str, Any]) -> list[PresetRow]:
 class SearchConfig(Section):
     """The search. Constants of the run."""
 
-    algorithm: Text = Field(
-        description="Name of the search algorithm: a shipped one, or module:function for one of your own."
-    )
+    algorithm: Text = Field(description="Name of the method: a shipped one, or `module:function` for one of your own.")
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
     centres: CountAtOnce = Field(
-        description="Number of centres searched side by side, each with its own optimiser. auto: as many as the method "
-        "usually has, 1 for a search of your own."
+        description="Number of centres searched side by side, each with its own optimiser. `auto`: as many as the "
+        "method usually has, 1 for a search of your own."
     )
     evaluation_episodes: CountAtOnce = Field(
-        30, description="Noise-free episodes on which each new centre is evaluated; they count as environment steps."
+        30, description="Noise-free episodes on which each new centre is evaluated. They count as environment steps."
     )
     max_invalid_fraction: Fraction = Field(
         0.5,
-        description="Share of invalid members, in whose episodes something is not finite, above which the run stops.",
+        description="Share of invalid members, in whose episodes something is not finite, above which the run stops "
+        "with an error. `status`, the end of a run and reports say the share of the last generation, if there were "
+        "any.",
     )
     allow_infeasible: Switch = Field(
         False,
-        description="Whether a fitness of -inf says that a point is infeasible, and not that something failed. It "
-        "ranks last and enters neither map nor novelty archive, as an invalid one does; the history counts it apart "
-        "and max_invalid_fraction leaves it out.",
+        description="Whether a fitness of -inf says that a point is infeasible, and not that something failed. Such "
+        "a member ranks last and enters neither map nor novelty archive, but is not counted as invalid: the history "
+        "has a column `infeasible_members`, and `search.max_invalid_fraction` leaves them out.",
     )
     init_from: Text | None = Field(
         None,
-        description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
-        "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
+        description="Policy of another run from which this run starts: `RUN` (its folder) for the centre updated "
+        "last, `RUN:best` for the best centre, or `RUN:3,17` for a cell's elite; `null` for random weights.",
     )
 
     if TYPE_CHECKING:  # for `config.search.sigma` in a user's program, whose config has such a method
@@ -185,15 +185,15 @@ class PopulationConfig(SearchConfig):
 
     pairs: CountAtOnce = Field(
         description="Antithetic pairs of a population, which has twice as many members. A generation has one "
-        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
+        "population, or one for each centre with `search.emitters` and `search.update: all`."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
     noise: Noise = Field(
         FullNoise(),
         discriminator="kind",
-        description="What a member adds to the parameters of a centre, times sigma. full: a normal number for each "
-        "parameter. low_rank: for each weight matrix a product of two thin matrices of normal numbers, which costs "
-        "less the wider the layers are; biases have a normal number each.",
+        description="What a member adds to the parameters of a centre, times `search.sigma`. `full`: a normal number "
+        "for each parameter. `low_rank`: for each weight matrix a product of two thin matrices of normal numbers, "
+        "which costs less the wider the layers are; biases have a normal number each.",
     )
     sigma_decay: Share = Field(
         1.0, description="Factor by which sigma changes in each generation; 1 keeps it. EvoJAX has 0.999."
@@ -202,9 +202,9 @@ class PopulationConfig(SearchConfig):
     step: Step = Field(
         AdamStep(learning_rate=0.01, l2=0.005),
         discriminator="kind",
-        description="How a centre moves along the gradient estimate. adam: by Adam. adamw: by Adam, with a weight "
-        "decay outside of its moments. plain: by the estimate times the learning rate. clipup: by ClipUp, a momentum "
-        "along normalised estimates with a greatest speed.",
+        description="How a centre moves along the gradient estimate. `adam`: by Adam. `adamw`: by Adam, with a "
+        "weight decay outside of its moments. `plain`: by the estimate times the learning rate. `clipup`: by ClipUp, "
+        "a momentum along normalised estimates with a greatest speed.",
     )
     learning_rate_decay: Share = Field(
         1.0, description="Factor by which the learning rate changes in each generation; 1 keeps it. EvoJAX has 0.999."
@@ -212,18 +212,20 @@ class PopulationConfig(SearchConfig):
     learning_rate_limit: NotNegative = Field(0.0, description="The learning rate never falls below this.")
     step_gate: Switch = Field(
         False,
-        description="Whether each step is shortened to the agreement of the two halves of the pairs: the learning rate "
-        "is multiplied by the cosine between their gradient estimates, or by 0 if that is negative.",
+        description="Whether each step is shortened to the agreement of the two halves of the pairs: the learning "
+        "rate is multiplied by the cosine between their gradient estimates, or by 0 if that is negative. Gradients "
+        "then cost twice as much.",
     )
     shaping: Shaping = Field(
         Ranks(),
         discriminator="kind",
-        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
-        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation. "
-        "top_pairs: the differences within the best pairs, over the standard deviation of the values of these pairs.",
+        description="How fitness, and novelty, become utilities of members. `ranks`: evenly spaced by rank. `signs`: "
+        "of each pair, only which member is better. `returns`: the values, less their mean, over their standard "
+        "deviation. `top_pairs`: the differences within the best pairs, over the standard deviation of the values of "
+        "these pairs.",
     )
     common_random_numbers: Switch = Field(
-        description="Whether the two members of a pair share resets and action noise. Set by the preset."
+        description="Whether the two members of a pair share resets and action noise."
     )
 
     presets = (
@@ -246,23 +248,23 @@ class CandidatesConfig(PopulationConfig):
 
     screened: CountAtOnce = Field(
         16,
-        description="Policies of the run that search.init_from names, from which the search starts: the best centre "
-        "and elites. Their first evaluation chooses search.candidates of them.",
+        description="Policies of the run that `search.init_from` names, from which the search starts: the best "
+        "centre and elites. Their first evaluation chooses `search.candidates` of them.",
     )
     candidates: Count = Field(4, description="Policies that remain after the first evaluation.")
     candidate_choice: Literal["fitness", "novelty", "place"] = Field(
         "fitness",
-        description="Which elites these are. fitness: the fittest. novelty: the most novel, in the novelty archive of "
-        "that run. place: those nearest to the middle of the target set of search.objective.",
+        description="Which elites these are. `fitness`: the fittest. `novelty`: the most novel, in the novelty "
+        "archive of that run. `place`: those nearest to the middle of the target set of `search.objective`.",
     )
     objective: Objective = Field(
         FitnessObjective(),
         discriminator="kind",
-        description="What members are ranked by, and candidates. fitness: what task.fitness says. return: the sum of "
-        "the rewards. final: the reward of the last step. goal_distance: how near to the goal an episode ends. "
-        "novelty, mixture: novelty, alone or beside fitness. target: fitness among those that end in a set of "
-        "descriptors, before all others, which rank by their distance from it. nearness: nearness to a descriptor "
-        "beside fitness.",
+        description="What members are ranked by, and candidates. `fitness`: what `task.fitness` says. `return`: the "
+        "sum of the rewards. `final`: the reward of the last step. `goal_distance`: how near to the goal an episode "
+        "ends. `novelty`: novelty. `mixture`: novelty and fitness. `target`: fitness among those that end in a set of "
+        "descriptors, before all others, which rank by their distance from it. `nearness`: nearness to a descriptor, "
+        "and fitness.",
     )
 
     only_centres = "search.screened"

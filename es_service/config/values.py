@@ -152,6 +152,14 @@ def described_keys(algorithms: Methods) -> list[DescribedKey]:
     return sorted(described, key=lambda row: sections.index(row.key.split(".")[0]))
 
 
+def methods_words(methods: tuple[str, ...], algorithms: Methods) -> str:
+    """Which methods have a key, in words; empty for all of them, or for a key of none."""
+    others = [name for name in algorithms if name not in methods]
+    if not others or not methods:
+        return ""
+    return f"all but {one_of(others, 'and')}" if len(others) < len(methods) else one_of(methods, "and")
+
+
 def _default_text(key: str, settings: type[SearchConfig]) -> str:
     """The default of a key with a method, as text."""
     field = (FIELDS | search_fields(settings))[key]

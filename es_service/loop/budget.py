@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from es_service.config.model import BudgetConfig
+from es_service.config.sections import BudgetConfig
 from es_service.errors import counted
 
 REACHED = {

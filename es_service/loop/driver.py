@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.model import BudgetConfig
 from es_service.config.search import PopulationConfig
+from es_service.config.sections import BudgetConfig
 from es_service.config.workload import policy_spec
 from es_service.loop import budget as budgets
 from es_service.loop.arrays import state_of

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from es_service.config.model import BudgetConfig
+from es_service.config.sections import BudgetConfig
 from es_service.config.tasks import CALLER
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import MOST_DURATIONS, REACHED, durations, limits_of, only_started, raised, spent

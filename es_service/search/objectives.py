@@ -11,7 +11,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.config.model import NoveltyConfig
 from es_service.config.parts import (
     FitnessObjective,
     MixtureObjective,
@@ -21,6 +20,7 @@ from es_service.config.parts import (
     Shaping,
     TargetObjective,
 )
+from es_service.config.sections import NoveltyConfig
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.novelty import NoveltyArchive, novelty
 from es_service.search.shaping import centred_ranks, shaped

@@ -20,7 +20,7 @@ RESULTS = {
 }
 """Classes with a fitness or return and a descriptor for each of some episodes, and why they are not the record."""
 NO_RESULTS = {
-    "es_service.config.model.TaskConfig",
+    "es_service.config.sections.TaskConfig",
     "es_service.protocol.messages.WorkerSpec",
     "es_service.search.maps.behaviour_map.BehaviourMap",
     "es_service.search.maps.kept.KeptPolicies",

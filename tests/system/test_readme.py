@@ -14,11 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from es_service.config.keys import FIELDS, all_search_fields, methods_with
-from es_service.config.search import preset_table
-from es_service.config.text import show
-from es_service.config.values import described_keys
+from es_service.cli.main import app
 from es_service.search.algorithms import OURS
 from tests.system import warm
 
@@ -27,8 +25,12 @@ USING = "es_service/guides/using.md"
 BUDGET_S = {
     "README.md": 400,
     USING: 600,
-    "configs/README.md": 200,
-    "configs/qdax_and_pyribs.md": 100,
+    "configs/README.md": 100,
+    "configs/methods.md": 200,
+    "configs/keys.md": 10,
+    "configs/sweeps.md": 100,
+    "configs/own_searches.md": 200,
+    "configs/other_libraries.md": 100,
     "docker/README.md": 10,
     "es_service/README.md": 100,
     "workers/README.md": 400,
@@ -227,57 +229,20 @@ def test_every_attribute_that_a_task_may_have_is_explained():
     assert known <= {*re.findall(r"`(\w+)[^`]*`", docstring)}
 
 
-def test_preset_table_is_the_code_s():
-    shown = TEXT["configs/README.md"].split("<!-- presets -->")[1].split("<!-- /presets -->")[0].strip()
-    rows = [
-        f"| `{row.key}`{f' of `{row.method}`' if row.method else ''} | {show(row.literature)} | {show(row.uber)} |"
-        for row in preset_table(OURS)
-    ]
-    assert sorted(shown.splitlines()[2:]) == sorted(rows)
-
-
-KEYS = FIELDS | all_search_fields(OURS)
-SOME_METHODS = {key: methods for key in KEYS if len(methods := methods_with(key, OURS)) < len(OURS)}
-"""Key that not every method has -> the methods that have it."""
-
-
-def test_every_key_of_a_config_is_explained_with_its_default():
-    tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
-    shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
-    assert len(shown) == len(dict(shown))
-    defaults = {row.key: row.default for row in described_keys(OURS)}
-    assert dict(shown).keys() == defaults.keys()
-    for key, value in shown:
-        assert value in (defaults[key], defaults[key].partition("; ")[0]), key
-
-
-def test_the_table_of_keys_of_methods_is_the_code_s():
-    shown = TEXT["configs/README.md"].split("<!-- keys of methods -->")[1].split("<!-- /keys of methods -->")[0]
-    found: dict[str, tuple[str, ...]] = {}
-    for keys, methods in re.findall(r"^\| (`.*`) \| (.*`) \|$", shown, re.MULTILINE):
-        named = re.findall(r"`(\w+)`", methods)
-        uses = [name for name in OURS if (name in named) != methods.startswith("all but ")]
-        found |= dict.fromkeys(re.findall(r"`([\w.]+)`", keys), tuple(uses))
-    assert found == SOME_METHODS
-
-
-def test_keys_of_a_few_methods_begin_with_their_names():
-    tables = TEXT["configs/README.md"].split("\n## Every key\n")[1]
-    for key, methods in SOME_METHODS.items():
-        if len(methods) <= 3:
-            (text,) = re.findall(rf"^\| `{key}` \| .*? \| (.*) \|$", tables, re.MULTILINE)
-            assert {name for name in OURS if re.search(rf"\b{name}\b", text)} >= set(methods), key
-            assert re.match(rf"(\w+, )*({'|'.join(methods)})\b.*?: ", text), key
+def test_the_page_of_keys_is_what_the_command_prints():
+    printed = CliRunner().invoke(app, ["config", "--keys", "--markdown"]).stdout
+    assert TEXT["configs/keys.md"] == printed, "es-service config --keys --markdown > configs/keys.md"
 
 
 @pytest.mark.parametrize("name", [*OURS, "module:function"])
 def test_every_method_has_its_section(name):
-    assert re.search(rf"^### .*`{name}`$", TEXT["configs/README.md"], re.MULTILINE)
+    guide = TEXT["configs/methods.md" if name in OURS else "configs/own_searches.md"]
+    assert re.search(rf"^## .*`{name}`$", guide, re.MULTILINE)
 
 
 def test_every_shipped_config_is_named():
     for path in (ROOT / "configs").glob("*.yaml"):
-        assert f"]({path.name})" in TEXT["configs/README.md"], path.name
+        assert f"]({path.name})" in TEXT["configs/methods.md"], path.name
 
 
 def anchors(text: str) -> set[str]:

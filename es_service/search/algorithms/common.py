@@ -13,9 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import NoveltyConfig, RunConfig
+from es_service.config.model import RunConfig
 from es_service.config.parts import Objective
 from es_service.config.search import PopulationConfig, SearchConfig
+from es_service.config.sections import NoveltyConfig
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (

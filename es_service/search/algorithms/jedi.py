@@ -57,7 +57,10 @@ The time of a fit grows with the cube of this."""
 class JediSettings(PopulationConfig):
     """Emitters, their targets, and the model of the map."""
 
-    emitters: CountAtOnce = Field(4, description="Number of evolution strategies side by side, each with a target.")
+    emitters: CountAtOnce = Field(
+        4,
+        description="Number of evolution strategies side by side, with `search.pairs` pairs each in every generation.",
+    )
     target_generations: Count = Field(100, description="Generations after which each emitter gets a new target.")
     target_weight_start: Fraction = Field(
         1.0, description="Weight of nearness to the target beside fitness in the first generation of a target."

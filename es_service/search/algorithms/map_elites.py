@@ -57,8 +57,8 @@ class MapElitesSettings(SearchConfig):
 
     batch: CountAtOnce = Field(
         256,
-        description="Number of policies that a generation makes and evaluates; with other search.elites than once, the "
-        "number of its samples.",
+        description="Number of policies that a generation makes and evaluates; with another `search.elites.kind` "
+        "than `once`, the number of its samples.",
     )
     iso_sigma: NotNegative = Field(
         0.005, description="Standard deviation of the noise in each parameter, in parameter units."

@@ -70,18 +70,18 @@ class MeEsSettings(EmittersSettings):
 
     alternation: Literal["round_robin", "coin"] = Field(
         "round_robin",
-        description="How exploring and exploiting blocks follow each other. round_robin: in turn. coin: each block is "
-        "chosen at random, with probability 1/2.",
+        description="How exploring and exploiting blocks follow each other. `round_robin`: in turn. `coin`: each "
+        "block is chosen at random, with probability 1/2.",
     )
-    first_block: Mode = Field(description="What the first block does with alternation round_robin. Set by the preset.")
+    first_block: Mode = Field(description="What the first block does with alternation `round_robin`.")
     block_generations: Count = Field(
         10,
         description="Generations in a block; each block starts from an elite drawn from the map, with a fresh "
         "optimiser.",
     )
     cell_sampling: Literal["top", "score", "uniform", "novelty", "least_tried", "fitness"] = Field(
-        description="How the cell of that elite is drawn: as in QDax (top), as in the released code (score), or as "
-        "search.starts of MEMES says; es_service/search/algorithms/me_es.py describes the first two. Set by the preset."
+        description="How the cell of that elite is drawn. `top`: as in QDax. `score`: as in the released code. The "
+        "other values are those of `search.starts`."
     )
 
     presets = (

@@ -71,12 +71,13 @@ class MemesSettings(EmittersSettings):
     exploit_generations: Count | None = Field(
         None,
         description="Generations after which an emitter that does not climb novelty begins again even if its centres "
-        "still enter the map, so that small gains at one place do not hold it there for ever; null: never.",
+        "still enter the map, so that small gains at one place do not hold it there for ever; `null`: never.",
     )
     starts: Starts = Field(
         "uniform",
-        description="How the elite is drawn. uniform: any. novelty: in proportion to its novelty. least_tried: one of "
-        "the cells from which the fewest emitters have begun. fitness: in proportion to its fitness above the lowest.",
+        description="How the elite is drawn from which an emitter begins again. `uniform`: any. `novelty`: in "
+        "proportion to its novelty. `least_tried`: one of the cells from which the fewest emitters have begun. "
+        "`fitness`: in proportion to its fitness above the lowest.",
     )
 
     presets = (

@@ -40,18 +40,16 @@ def nsr_es(config: RunConfig) -> Algorithm:
 class NsraSettings(CentresSettings):
     """Several centres, and how the weight of fitness adapts."""
 
-    fitness_weight_start: Fraction = Field(
-        description="Weight of fitness beside novelty at the start. Set by the preset."
-    )
+    fitness_weight_start: Fraction = Field(description="Weight of fitness beside novelty at the start.")
     fitness_weight_step: Fraction = Field(
         0.05, description="How much the weight of fitness rises after an improvement or falls in stagnation."
     )
     fitness_weight_patience: Count = Field(
-        description="Generations without improvement before the weight of fitness falls. Set by the preset."
+        description="Generations without improvement before the weight of fitness falls."
     )
     fitness_weight_min_gain: NotNegative = Field(
         description="A centre is an improvement if its fitness exceeds the record by more than this fraction of the "
-        "record's absolute value. Set by the preset."
+        "record's absolute value."
     )
 
     presets = (

@@ -13,11 +13,11 @@ from es_service.errors import ConfigError
 
 Settings = TypeVar("Settings", bound=SearchConfig)
 ELITES = (
-    "How the elites of the map are measured. once: when they enter it, and never again. The other kinds keep several "
-    "policies in each cell and measure some of them again in each generation, so that what was luck falls, moves to "
-    "another cell or leaves. eme: Extract-ME. archive_sampling: all of them, in every generation. Of map_elites only: "
-    "me_sampling, which measures new policies many times and none again; deep_grid, which measures each once and "
-    "replaces any."
+    "How the elites of the map are measured. `once`: when they enter it, and never again. The other kinds keep several "
+    "policies in each cell and measure some of them again in each generation. What was luck then falls, moves to "
+    "another cell or leaves. `eme`: Extract-ME. `archive_sampling`: all of them, in every generation. `me_sampling`: "
+    "new policies many times, and none again. `deep_grid`: each policy once; it replaces any. Only a method that makes "
+    "single policies has the last two."
 )
 """Description of `search.elites`."""
 
@@ -47,13 +47,13 @@ class CentresSettings(PopulationConfig):
 
     update: Literal["one", "all"] = Field(
         "one",
-        description="How many of the centres a generation updates. one: that of search.centre_choice. all: every "
-        "centre, with search.pairs pairs each.",
+        description="How many of the centres a generation updates. `one`: that of `search.centre_choice`. `all`: "
+        "every centre, with `search.pairs` pairs each.",
     )
     centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
-        description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
-        "round_robin: in turn. uniform: all with the same probability.",
+        description="How the centre to update is chosen. `novelty`: with probability proportional to its novelty. "
+        "`round_robin`: in turn. `uniform`: all with the same probability.",
     )
 
     first_centres = 5
@@ -87,23 +87,25 @@ class EmittersSettings(PopulationConfig):
     """Keys of methods with one centre for each of several emitters, which start from elites of the map."""
 
     emitters: CountAtOnce = Field(
-        1, description="Number of evolution strategies side by side, with search.pairs pairs each in every generation."
+        1,
+        description="Number of evolution strategies side by side, with `search.pairs` pairs each in every generation.",
     )
     mode: Literal["explore_exploit", "explore", "exploit"] = Field(
         "explore_exploit",
-        description="What an emitter, or a block, maximises. explore: novelty. exploit: fitness. explore_exploit: one "
-        "of the two, by turns unless search.alternation says otherwise.",
+        description="What an emitter, or a block, maximises. `explore`: novelty. `exploit`: fitness. "
+        "`explore_exploit`: one of the two, by turns unless `search.alternation` says otherwise.",
     )
     objectives: Objectives | None = Field(
         None,
-        description="What emitters, or blocks, maximise, in turn: emitter or block k the (k modulo their number)-th. "
-        "null: what search.mode says, which is ignored otherwise.",
+        description="What blocks, or emitters, maximise in turn, as a list of objectives, such as `[{kind: novelty}, "
+        "{kind: target, descriptor: [35, -25], radius: 5}]`; `null`: what `search.mode` says, which is ignored "
+        "otherwise.",
     )
     parent_statistics: Literal["global", "elite"] = Field(
         "global",
-        description="Observation statistics that an emitter uses. global: those of the whole run. elite: those with "
-        "which the elite at its start was evaluated. With elite, all elites descend from the first centre and keep its "
-        "statistics, so observations are not normalised unless the run started from a policy of another run.",
+        description="Observation statistics that a block uses. `global`: those of the whole run. `elite`: those with "
+        "which the elite at its start was evaluated. With `elite`, all elites descend from the first centre and keep "
+        "its statistics, so observations are not normalised unless the run started from a policy of another run.",
     )
 
     elites: ElitesOfCentres = Field(Once(), discriminator="kind", description=ELITES)

@@ -20,7 +20,7 @@ from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 
 if TYPE_CHECKING:
-    from es_service.config.model import MapConfig
+    from es_service.config.sections import MapConfig
 
 LATTICE_PER_CELL = 8
 """Number of places along each side of a cell that are tested to find out whether the cell can be reached."""
