@@ -21,7 +21,9 @@ GUIDES = {
         name: tuple(folder / f"{file}.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs"))
         for name, file in {
             "configs": "README",
+            "which_method": "which_method",
             "methods": "methods",
+            "parts": "parts",
             "keys": "keys",
             "sweeps": "sweeps",
             "own_searches": "own_searches",

@@ -100,8 +100,8 @@ class AdamStep(Section):
     )
     l2: NotNegative = Field(
         0.005,
-        description="Weight decay, added to the gradient before the step: lambda in -g + lambda x. `adamw`: the "
-        "share of a centre, times `learning_rate`, that each step takes away.",
+        description="Weight decay, added to the gradient before the step: lambda in -g + lambda x. `adamw`: the share "
+        "of a centre, times `learning_rate`, that each step takes away.",
     )
 
 
@@ -174,8 +174,8 @@ class TopPairs(Section):
     kind: Literal["top_pairs"] = "top_pairs"
     count: Count | None = Field(
         None,
-        description="Of kind `top_pairs`: number of pairs from which a step is computed, those with the highest "
-        "value of their better member; `null`: all pairs.",
+        description="Of kind `top_pairs`: number of pairs from which a step is computed, those with the highest value "
+        "of their better member; `null`: all pairs.",
     )
 
 
@@ -269,14 +269,14 @@ class Measured(Section):
     )
     again: Again = Field(
         0.25,
-        description="Share of a generation's episodes that measure kept policies again; `all`: every kept policy "
-        "once in each generation, besides the other episodes.",
+        description="Share of a generation's episodes that measure kept policies again; `all`: every kept policy once "
+        "in each generation, besides the other episodes.",
     )
     draw: Literal["exponential", "linear", "harmonic", "uniform"] = Field(
         "exponential",
-        description="How these policies are drawn, by their rank in their cell, 0 for the fittest: in proportion to "
-        "exp(-rank) (`exponential`), to the deepest rank + 1 - rank (`linear`), to 1 / (rank + 1) (`harmonic`), or "
-        "all alike (`uniform`).",
+        description="How these policies are drawn, by their rank in their cell, 0 for the fittest. `exponential`: in "
+        "proportion to exp(-rank). `linear`: to the deepest rank + 1 - rank. `harmonic`: to 1 / (rank + 1). "
+        "`uniform`: all alike.",
     )
     estimate: Literal["mean", "median"] = Field(
         "mean",
@@ -291,8 +291,8 @@ class MeasuredNewcomers(Measured):
     first_samples: Count = Field(2, description="Samples of each new policy before it is compared.")
     replaces: Literal["worst", "any"] = Field(
         "worst",
-        description="What a new policy replaces in a full cell. `worst`: the least fit, if that is less fit. `any`: "
-        "a random one, whatever its fitness; parents are then drawn from all policies of a cell, in proportion to "
+        description="What a new policy replaces in a full cell. `worst`: the least fit, if that is less fit. `any`: a "
+        "random one, whatever its fitness; parents are then drawn from all policies of a cell, in proportion to "
         "their fitness above the lowest.",
     )
 

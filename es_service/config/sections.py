@@ -105,9 +105,10 @@ class PolicyConfig(Section):
     output: Output = Field(
         "tanh",
         description="What makes an action of the last layer; the default is `argmax` where a task has actions to "
-        "choose from. `tanh`; `linear`, the numbers themselves; `argmax`, 1 for the greatest and 0 for the others; "
-        "`categorical`, the same drawn by softmax probabilities; `gaussian`, tanh of a normal variate with a mean and "
-        "a spread of the last layer. Evaluations take the most probable action.",
+        "choose from. `tanh`: the tanh of each number. `linear`: the numbers themselves. `argmax`: 1 for the "
+        "greatest and 0 for the others. `categorical`: the same, drawn by softmax probabilities. `gaussian`: tanh "
+        "of a normal variate, whose mean and spread the last layer gives. Evaluations take the most probable "
+        "action.",
     )
     bias: Switch = Field(True, description="Whether layers have biases.")
     init: Literal["unit_columns", "small_columns"] = Field(
@@ -164,19 +165,19 @@ class MapConfig(Section):
         "lloyd",
         description="Of kind `cvt`: how the centroids are placed. `lloyd`: by 20 steps of Lloyd's algorithm on 50 "
         "random places for each. `kmeans`: by SciPy's k-means on 10 places for each, which is faster and less even. "
-        "For 1,024 cells in seven dimensions, 10 s and 1.3 s on a core of a Zen 4. What takes more than 2 s is said, "
-        "and what would take more than 10 minutes is refused.",
+        "For 1,024 cells in seven dimensions, 10 s and 1.3 s on a core of a Zen 4. What takes more than 2 s is "
+        "said, and what would take more than 10 minutes is refused.",
     )
     qd_offset: Number = Field(
-        description="Fitness that counts as 0 in the QD-score. `auto`: the lowest reward of the task, times the "
-        "steps of an episode with `task.fitness: sum`; 0 if the task specifies no lowest reward: elites of negative "
-        "fitness then lower the score as the map fills; reports also draw it from the least fitness evaluated."
+        description="Fitness that counts as 0 in the QD-score. `auto`: the lowest reward of the task, times the steps "
+        "of an episode with `task.fitness: sum`; 0 if the task specifies no lowest reward. Elites of negative "
+        "fitness then lower the score as the map fills. Reports also draw it from the least fitness evaluated."
     )
     correct_every: Count | None = Field(
         None,
         description="All elites are evaluated in new episodes after each generation whose number is a multiple of "
-        "this, for the corrected columns of the history. These episodes count as environment steps; the search learns "
-        "nothing from them. `null`: never, and no such columns.",
+        "this, for the corrected columns of the history. These episodes count as environment steps; the search "
+        "learns nothing from them. `null`: never, and no such columns.",
     )
     correct_episodes: Count = Field(32, description="Episodes of each elite there.")
 
@@ -188,11 +189,11 @@ class BudgetConfig(Section):
     env_steps: Count | None = Field(None, description="Number of environment steps, evaluations included.")
     wall_clock_s: Positive | None = Field(
         None,
-        description="Running time in seconds, summed over all sessions, from the start of workers on: with their "
-        "starting and compiling, but without a wait for a first place in a cluster, certifications, and the time "
-        "between a stop and a resume. No generation begins if the shortest of the last five (of at least two) would "
-        "end after the limit; the end says by how much the limit was exceeded. A run that has no time for its first "
-        "generation is not finished: `status`, `sweep` and `Outcome.is_finished` say so.",
+        description="Running time in seconds, summed over all sessions, from the start of workers on. It includes "
+        "their starting and compiling. It does not include a wait for a first place in a cluster, certifications, "
+        "and the time between a stop and a resume. No generation begins if the shortest of the last five (of at "
+        "least two) would end after the limit; the end says by how much the limit was exceeded. A run that has no "
+        "time for its first generation is not finished: `status`, `sweep` and `Outcome.is_finished` say so.",
     )
     rollout_s: Positive | None = Field(
         None,
@@ -221,10 +222,9 @@ class StoreConfig(Section):
 
     keep_every: Count | None = Field(
         None,
-        description="The states of generations whose number is a multiple of this are kept, so that the command "
-        "`verify` can compute from them, a fork can begin there, and a damaged run can fall back to them. `null`: only "
-        "those of the last two generations. A change applies to later generations; kept states before the last two "
-        "remain.",
+        description="The states of generations whose number is a multiple of this are kept. The command `verify` can "
+        "compute from them, a fork can begin there, and a damaged run can fall back to them. `null`: only those of "
+        "the last two generations. A change applies to later generations; kept states before the last two remain.",
     )
 
 
@@ -233,10 +233,10 @@ class WorkerResources(Section):
 
     cpu: Literal["auto"] | Count = Field(
         "auto",
-        description="With engine `ray`: cores of each actor, all of which it uses (with `simd` by threads, with "
-        "`xla` by child processes). `auto`: in a cluster those of a node if all nodes have equally many, so that a "
-        "node needs few messages; else 1, also with a GPU and with a Ray instance on this machine only. It must "
-        "divide `compute.workers`.",
+        description="With engine `ray`: cores of each actor, all of which it uses (with `simd` by threads, with `xla` "
+        "by child processes). `auto`: in a cluster those of a node if all nodes have equally many, so that a node "
+        "needs few messages; else 1. With a GPU, and with a Ray instance on this machine only, it is 1, too. It "
+        "must divide `compute.workers`.",
     )
     gpu: NotNegative = Field(
         0.0,
@@ -249,9 +249,9 @@ class ComputeConfig(Section):
     """How the work is divided and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
 
     engine: Literal["ray", "inline"] = Field(
-        description="How the workers run. `inline`: as child processes of this program. `ray`: as Ray actors, on "
-        "this machine or in a cluster. `auto`: `ray` if an address is given or actors have several cores, else "
-        "`inline`, which starts sooner and sends messages faster."
+        description="How the workers run. `inline`: as child processes of this program. `ray`: as Ray actors, on this "
+        "machine or in a cluster. `auto`: `ray` if an address is given or actors have several cores, else `inline`, "
+        "which starts sooner and sends messages faster."
     )
     inline_workers: Literal["processes", "threads"] = Field(
         "processes",
@@ -269,8 +269,8 @@ class ComputeConfig(Section):
         description="Number of workers, each of which is a core, or with GPUs its share of them. `auto`: every core "
         "of the machine or cluster that has work, or with the engine `inline` and GPUs as many as these have room "
         "for. With a number in `compute.worker_resources.cpu`, it also asks the cluster for up to 32 actors beyond "
-        "its room, as far as there is work for them, so that an autoscaler starts nodes. No more start than there is "
-        "work for in a generation, in whole actors; a note says so.",
+        "its room, as far as there is work for them, so that an autoscaler starts nodes. No more start than there "
+        "is work for in a generation, in whole actors; a note says so.",
     )
     platform: Literal["any", "x86_64", "aarch64"] = Field(
         "any",
@@ -290,13 +290,13 @@ class ComputeConfig(Section):
     )
     rollout: Text = Field(
         description="How episodes are computed. `simd`: by code compiled for this kind of processor or GPU, about "
-        "twenty times faster. `xla`: by JAX, for tasks that simd cannot compile. `host`: by the Python code of a task "
-        "that is not in JAX. `auto`: the fastest that can."
+        "twenty times faster. `xla`: by JAX, for tasks that simd cannot compile. `host`: by the Python code of a "
+        "task that is not in JAX. `auto`: the fastest that can."
     )
     chunk_pairs: Count = Field(
-        description="Pairs in one chunk; must divide `search.pairs`. `auto`: the largest divisor of `search.pairs` "
-        "up to an eighth of it (this limit is at least 16 and at most 64), and a multiple of 8 if there is one; with "
-        "GPUs the largest divisor up to 4,096."
+        description="Pairs in one chunk; must divide `search.pairs`. `auto`: the largest divisor of `search.pairs` up "
+        "to an eighth of it, and a multiple of 8 if there is one. This limit is at least 16 and at most 64; with "
+        "GPUs it is 4,096."
     )
     rollout_block_pairs: Count = Field(
         description="With rollout `xla`: pairs whose episodes step together, so that their weights stay in the "
@@ -329,14 +329,14 @@ class ComputeConfig(Section):
     place_timeout_s: Positive | None = Field(
         None,
         description="With engine `ray` in a cluster: longest time in seconds for which the run waits for a first "
-        "place, before it stops and asks for no more places. `null`: as long as it takes. `status` says that the run "
-        "waits. The wait is no part of `budget.wall_clock_s`.",
+        "place, before it stops and asks for no more places. `null`: as long as it takes. `status` says that the "
+        "run waits. The wait is no part of `budget.wall_clock_s`.",
     )
     no_worker_timeout_s: Patience = Field(
         120.0,
         description="Seconds without a live worker, after the first had come up, after which the run stops, with "
-        "everything saved; at least 20. A worker that has not started after half of this time is replaced; on a busy "
-        "machine a start takes up to ten seconds.",
+        "everything saved; at least 20. A worker that has not started after half of this time is replaced; on a "
+        "busy machine a start takes up to ten seconds.",
     )
     parent_cache_mb: Count = Field(
         256,

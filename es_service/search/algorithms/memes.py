@@ -70,8 +70,8 @@ class MemesSettings(EmittersSettings):
     )
     exploit_generations: Count | None = Field(
         None,
-        description="Generations after which an emitter that does not climb novelty begins again even if its centres "
-        "still enter the map, so that small gains at one place do not hold it there for ever; `null`: never.",
+        description="Generations after which an emitter that does not climb novelty begins again, even if its centres "
+        "still enter the map. So small gains at one place do not hold it there for ever. `null`: never.",
     )
     starts: Starts = Field(
         "uniform",
