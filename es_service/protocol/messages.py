@@ -3,6 +3,9 @@
 Axes: D policy parameters, P antithetic pairs of one chunk, S sign [+, -], E episodes of one evaluation chunk, L slots
 of one policy chunk, O observation, B descriptor dimensions, T points of a trace. Both sides import this module and it
 imports neither.
+
+The result of a chunk depends only on the config, the seed, the generation, the ask, the chunk id, the centre and the
+observation statistics: not on the worker, on the order, or on how often the chunk is computed.
 """
 
 from __future__ import annotations
