@@ -32,6 +32,9 @@ GUIDES = {
         }.items()
     },
     "workers": (CLONE / "workers" / "README.md",),
+    "own_tasks": (CLONE / "workers" / "own_tasks.md",),
+    "other_suites": (CLONE / "workers" / "other_suites.md",),
+    "policies": (CLONE / "workers" / "policies.md",),
     "docker": (CLONE / "docker" / "README.md", PACKAGE / "launch_files" / "README.md"),
     "es_service": (PACKAGE / "README.md",),
     "simd": (CLONE / "workers" / "simd" / "README.md",),

@@ -237,7 +237,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     tasks.add_row("gymnax:NAME", "an environment of gymnax 1.0, such as gymnax:CartPole-v1")
     tasks.add_row("playground:NAME", "an environment of MuJoCo Playground 0.2, such as playground:CartpoleBalance")
     tasks.add_row("gymnasium:ID", "an environment of Gymnasium, with Box or Discrete spaces")
-    tasks.add_row("module:Class", "a task of your own in JAX; see workers/README.md")
+    tasks.add_row("module:Class", "a task of your own in JAX; see workers/own_tasks.md")
     tasks.add_row("python:module:Class", "a task of your own in Python: an object with reset and step")
     tasks.add_row("function:module:name", "a function of parameters of your own, without a policy")
     console.print(tasks)

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from es_service.environments.sb3 import SB3VecEnv  # noqa: E402
 
-GUIDE = Path(__file__).parents[2] / "workers" / "README.md"
+GUIDE = Path(__file__).parents[2] / "workers" / "other_suites.md"
 
 
 @pytest.mark.parametrize("task", ["point_maze", POLE])
