@@ -159,7 +159,7 @@ NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/
 NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/common.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
 RECIPES = "es_service/protocol/recipes.py"
-KEPT_PARENTS = "es_service/protocol/kept_parents.py"
+SENT = "es_service/protocol/sent.py"
 ADAM, SHAPING = "es_service/search/steps.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, ARRAYS = "es_service/search/maps/behaviour_map.py", "es_service/loop/arrays.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
@@ -539,16 +539,16 @@ CASES = [
         (
             "are made with their own parents exchanged",
             RECIPES,
-            "Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())",
-            "Origin(recipes.rule, recipes.names[y], recipes.names[x], key_4.copy())",
+            "Origin(self.rule, self.names[x], self.names[y], key_4.copy())",
+            "Origin(self.rule, self.names[y], self.names[x], key_4.copy())",
         ),
         (
             "are forgotten while they are needed",
-            KEPT_PARENTS,
-            "self.forget_oldest(self._most_bytes, spared=wanted)",
+            SENT,
+            "self.forget_oldest(self._most_bytes, spared=names)",
             "self.forget_oldest(self._most_bytes)",
         ),
-        ("are made before what they are made of", KEPT_PARENTS, "return dict(reversed(steps.items()))", "return steps"),
+        ("are made before what they are made of", SENT, "return dict(reversed(steps.items()))", "return steps"),
     ),
     *cases(
         "an elite's fitness",

@@ -14,19 +14,18 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.newest_output import newest_output
 from es_service.protocol.process_environment import DEPTH, worker_environment
 from es_service.protocol.raised import sendable
+from es_service.protocol.sent import LackingError, Received
 from es_service.protocol.sources import OtherCodeError, why_refused
 from workers import progress
 from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # they import JAX, whose settings are made here
     from workers.compilable import Compilable
-    from workers.parents import Parents
     from workers.reports import Reports
 
 KEPT_LOGS = 16
@@ -49,10 +48,10 @@ class WorkerActor:
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
         self._task_code: tuple[str, ...] = ()
         self._run_chunks: Compilable | None = None
-        self._parents: Parents | None = None
+        self._received: Received | None = None
         self._reports: Reports | None = None
         self._turn = Lock()
-        """Held while it compiles, and while it keeps the parents of policies that came with a call."""
+        """Held while it compiles, and while it takes the arrays that came with a call."""
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -89,55 +88,51 @@ class WorkerActor:
             del os.environ[name]
         os.environ.update({DEPTH: "1"} | environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
-        from workers.parents import Parents
         from workers.reports import Reports, require_room
         from workers.rollouts import BACKENDS, platform_of_gpu
 
         self._task_code = spec.task_code
-        self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
+        self._received = Received(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(*self._task_code):
             self._reports = Reports(spec, self._cores)
             self._run_chunks = make_worker_with_cores(spec, self._cores)
             require_room(spec, self._cores)
         return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
-    def compile(self, chunks: bytes, *parts: bytes) -> float:
+    def compile(self, item: bytes, *arrays: bytes) -> float:
         """Compile for chunks without running them; returns the seconds that it took. The arguments are those of `run`.
 
         The engine calls this before the first call of `run` for each kind of chunk.
         """
         assert self._run_chunks is not None, "compile was called before build"
         with self._turn, sendable(*self._task_code):
-            return self._run_chunks.seconds_to_compile(self._unpacked(chunks, parts))
+            return self._run_chunks.seconds_to_compile(self._unpacked(item, arrays))
 
-    def run(self, chunks: bytes, *parts: bytes) -> bytes:
-        """Run chunks; returns the pickled (results, its report or None), or None if it lacks parents of policies.
+    def run(self, item: bytes, *arrays: bytes) -> bytes:
+        """Run chunks; returns the pickled (results, its report or None), or None if it lacks arrays.
 
         Args:
-            chunks: pickled ([subject], [(index of its subject among these and then `parts`, Chunk)]); with them travel
-                policies that are made of recipes, which are small and for one call.
-            parts: other subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
+            item: pickled (arrays by name, origins, work) of a `Parcel`.
+            arrays: large arrays by name, each pickled.
         """
         assert self._run_chunks is not None, "run was called before build"
         assert self._reports is not None, "build makes them, too"
         with sendable(*self._task_code):
             try:
                 with self._turn:
-                    work = self._unpacked(chunks, parts)
+                    work = self._unpacked(item, arrays)
             except LackingError:
                 return pickle.dumps(None)
             self._reports.note(results := self._run_chunks(work))
             return pickle.dumps((results, self._reports.report()), pickle.HIGHEST_PROTOCOL)
 
-    def _unpacked(self, chunks: bytes, parts: tuple[bytes, ...]) -> list[Work]:
+    def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""
-        assert self._parents is not None, "build makes it, too"
-        subjects, indexed = pickle.loads(chunks)
-        known = [*subjects, *map(pickle.loads, parts)]
-        for part in known:
-            if isinstance(part, dict):
-                self._parents.receive(part)
-        return self._parents.complete([(known[index], chunk) for index, chunk in indexed])
+        assert self._received is not None, "build makes it, too"
+        small, origins, work = pickle.loads(item)
+        for named in (small, *map(pickle.loads, arrays)):
+            self._received.add(named)
+        return self._received.work(origins, work)
 
 
 def remove_old_logs(own: Path) -> None:

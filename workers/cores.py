@@ -12,14 +12,14 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.child import end_with
 from es_service.protocol.gradient_tree import with_neighbours_added
-from es_service.protocol.kept_parents import with_made_policies
-from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
+from es_service.protocol.messages import ChunkResult, Work, WorkerSpec, recipes_in
 from es_service.protocol.raised import sendable
 from workers import progress
 from workers.compilable import Compilable
@@ -70,6 +70,17 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
             _together(pool, _compile_in_child, [(call, with_made_policies(work))] * cores)
 
     return Compilable(run, compile_in_children)
+
+
+def with_made_policies(work: Sequence[Work]) -> list[Work]:
+    """A work item with the parameters of policies in the place of their recipes, which need more bytes with the
+    parents."""
+    made: dict[int, Any] = {}
+    for subject, _ in work:
+        if id(subject) not in made:
+            recipes = recipes_in(subject)
+            made[id(subject)] = subject if recipes is None else replace(subject, parameters_N_D=recipes.made())
+    return [(made[id(subject)], chunk) for subject, chunk in work]
 
 
 def divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:

@@ -15,19 +15,15 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
-from operator import attrgetter
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from es_service.protocol.kept import Kept
-from es_service.protocol.kept_parents import LackingError
-from es_service.protocol.kept_subjects import forget_old_subjects
-from es_service.protocol.messages import Subject, WorkerSpec
+from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.raised import RaisedError, raised
+from es_service.protocol.sent import LackingError, Received
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers import progress
-from workers.parents import Parents
 from workers.progress import Seen
 from workers.reports import Reports, require_room
 from workers.rollouts import BACKENDS, platform_of_gpu
@@ -48,14 +44,13 @@ def main(descriptor: int) -> None:
 
     The parent sends over this socket the byte "s" and the WorkerSpec of a run, and then for each of its workers one
     byte with the descriptor of the worker's socket; for another run, when these workers have ended, the same again. A
-    worker receives ("subject", number, Subject), ("parents", {name: parameters or Origin}) and
-    ("chunks", item, attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It
-    sends ("broken", RaisedError), or ("up", `platform_of_gpu`) and then for each work item ("results", item, attempt,
-    [ChunkResult]), ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies,
-    ("lacks", item, attempt). Before it computes the first work item of a kind, it compiles for it and sends
-    ("compiled", kind, seconds). While it takes long for something, its start included, it sends ("progress", doing,
-    done, total) as in `progress.Seen` when it has done more of it; and ("report", Report) when there is anything to
-    report.
+    worker receives ("arrays", {name: array}) and ("work", item, attempt, origins, work), in which `item` names the work
+    item, and the rest is as in a `Parcel`. It sends ("broken", RaisedError), or ("up", `platform_of_gpu`) and then for
+    each work item ("results", item, attempt, [ChunkResult]), ("failure", item, attempt, RaisedError) or, if it has not
+    been sent all arrays, ("lacks", item, attempt). Before it computes the first work item of a kind, it compiles for it
+    and sends ("compiled", kind, seconds). While it takes long for something, its start included, it sends ("progress",
+    doing, done, total) as in `progress.Seen` when it has done more of it; and ("report", Report) when there is anything
+    to report.
     """
     os.set_inheritable(descriptor, False)
     with socket.socket(fileno=descriptor) as control:
@@ -157,21 +152,18 @@ def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: Worker
             said.say("broken", ready)
             return
         said.say("up", platform_of_gpu(spec.rollout))
-        subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
-        parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
+        received = Received(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         compiled: set[str] = set()
         # Threads of one process would report the progress of others, and hide one that hangs.
         progress_of_item = nullcontext if BACKENDS[spec.rollout].runs_in_threads else said.progress
         while True:
             match receive(parent):
-                case ("subject", number, subject):
-                    subjects.add(number, subject)
-                case ("parents", given):
-                    parents.receive(given)
-                case ("chunks", item, attempt, chunks):
+                case ("arrays", arrays):
+                    received.add(arrays)
+                case ("work", item, attempt, origins, pickled):
                     try:
                         with progress_of_item():
-                            work = parents.complete([(subjects[number], chunk) for number, chunk in chunks])
+                            work = received.work(origins, pickled)
                             if (kind := type(work[0][1]).__name__) not in compiled:
                                 known = kind in ready.compiled
                                 seconds = 0.0 if known else ready.run_chunks.seconds_to_compile(work)
@@ -186,7 +178,6 @@ def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: Worker
                         answer = ("failure", item, attempt, raised(error, *spec.task_code))
                     said.say(*answer)
                     said.report()
-                    forget_old_subjects(subjects)
 
 
 class _Said:

@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from itertools import count
 
 from es_service.dispatch.cores import places
 from es_service.dispatch.dispatch_log import Log, no_log
@@ -34,12 +33,11 @@ from es_service.dispatch.events import (
 )
 from es_service.dispatch.staying import staying
 from es_service.protocol.child import Child, socket_pair
-from es_service.protocol.kept import Kept
-from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
-from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
-from es_service.protocol.messages import Report, Subject, Work, WorkerSpec
+from es_service.protocol.content import Cache
+from es_service.protocol.messages import FloatArray, Report, Work, WorkerSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
+from es_service.protocol.sent import LACKS_AGAIN, SENDER_BYTES, Memory, parcel
 from es_service.protocol.wire import Channel, framed
 
 PIECE_S = 0.1
@@ -83,14 +81,12 @@ class _Worker:
     use: Hashable
     """What the child can be used for, if it stays."""
     channel: Channel
-    parents: KeptParents[int]
-    """Sizes of the parents of policies that it keeps."""
-    subjects: Kept[int, int] = field(default_factory=lambda: Kept(int))
-    """Bytes of the subjects that it has, by their numbers."""
+    memory: Memory[int]
+    """Sizes of the arrays that it has."""
     unanswered: dict[tuple[Hashable, int], Sequence[Work]] = field(default_factory=dict)
     """Work items that it was sent and has not answered, by id and attempt."""
     lacking: set[tuple[Hashable, int]] = field(default_factory=set)
-    """Those of them for which it has lacked parents once."""
+    """Those of them for which it has lacked arrays once."""
 
 
 class ChildProcesses:
@@ -116,7 +112,8 @@ class ChildProcesses:
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
-        self._subjects, self._numbers = MadeOnce(self._framed_subject), count()
+        self._frames: Cache[bytes, bytes] = Cache(len)
+        """Messages with the newest arrays, by name."""
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
@@ -156,22 +153,14 @@ class ChildProcesses:
         return ""
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Send the chunks, after those of their subjects and of the parents of policies that the worker lacks."""
+        """Send the chunks, after the arrays that the worker lacks."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child, which `receive` is going to report
-        frames, numbered = [], []
-        for subject, chunk in work:
-            number, frame = self._subjects.of(subject)
-            if number not in to.subjects:
-                to.subjects.add(number, subject.nbytes)
-                frames.append(frame)
-            numbered.append((number, chunk))
-        frames += [framed(("parents", parents)) for parents in apart(parents_to_send(work, to.parents))]
-        forget_old_subjects(to.subjects)
-        forget_old_subjects(self._subjects)
+        arrays, origins, pickled = parcel(work, to.memory)
+        frames = [self._framed(*named) for named in arrays.items()]
         to.unanswered[item_id, attempt] = work
-        to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
+        to.channel.send(*frames, framed(("work", item_id, attempt, origins, pickled)))
         self._watch(to.channel)
 
     def platforms(self) -> frozenset[str]:
@@ -233,13 +222,16 @@ class ChildProcesses:
             raise
         return use, child
 
-    def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
-        """A new number for a subject, and the message with both."""
-        number = next(self._numbers)
-        return number, framed(("subject", number, as_sent(subject)))
+    def _framed(self, name: bytes, array: FloatArray) -> bytes:
+        """The message with an array, which is made once for all workers."""
+        if (frame := self._frames.get(name)) is None:
+            frame = framed(("arrays", {name: array}))
+            self._frames.add(name, frame)
+            self._frames.forget_oldest(SENDER_BYTES)
+        return frame
 
     def _add(self, number: int, child: Child, ours: socket.socket, place: str = "", use: Hashable = None) -> None:
-        self._workers[number] = _Worker(child, place, use, Channel(ours), KeptParents(self._parent_cache_bytes, int))
+        self._workers[number] = _Worker(child, place, use, Channel(ours), Memory(self._parent_cache_bytes, int))
         self._by_descriptor[ours.fileno()] = number
         self._poll.register(ours, select.POLLIN)
 
@@ -289,7 +281,7 @@ class ChildProcesses:
                         self._ready.append(Failure(number, item_id, attempt, LACKS_AGAIN, ""))
                     case ("lacks", item_id, attempt):
                         worker.lacking.add((item_id, attempt))
-                        worker.parents.clear()
+                        worker.memory.clear()
                         self.send(number, item_id, attempt, worker.unanswered[item_id, attempt])
                     case ("broken", error):
                         return error

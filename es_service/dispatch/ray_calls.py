@@ -15,15 +15,13 @@ from typing import Any
 from es_service.dispatch.events import Progress
 from es_service.dispatch.ray_nodes import Membership
 from es_service.errors import EvaluationError
-from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce, forget_old_subjects
-from es_service.protocol.messages import FloatArray, Report, Subject, Work, recipes_in
+from es_service.protocol.content import Cache
+from es_service.protocol.messages import Report, Work
 from es_service.protocol.raised import RaisedError
-from es_service.protocol.recipes import Origin
+from es_service.protocol.sent import SENDER_BYTES, Memory, parcel
 
 IN_CALL_BYTES = 64 * 2**10
-"""Largest size in bytes of a subject or of a parent of policies that is sent with every call; a larger one is stored,
-and fetched once per node."""
+"""Largest size in bytes of an array that is sent with a call; a larger one is stored, and fetched once per node."""
 LOOKS = "looks"
 """Concurrency group of actors in which they answer how far they are."""
 LOOK_S = 1.0
@@ -141,57 +139,32 @@ class Looks:
 
 
 class Arguments:
-    """Arguments of calls that get chunks. A large subject is stored once for all calls that share it."""
+    """Arguments of calls that get chunks. A large array is stored once for all calls that share it."""
 
     def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
-        self._subjects = MadeOnce(self._packed)
-        self._parents: KeptParents[tuple[Any, int]] = KeptParents(KEPT_BYTES, itemgetter(1))
-        """Large parents that are stored: their references and bytes."""
+        self._stored: Cache[bytes, tuple[Any, int]] = Cache(itemgetter(1))
+        """References and bytes of the newest arrays that are stored, by name."""
 
-    def of(self, work: Sequence[Work], kept: KeptParents[int]) -> tuple[Any, ...]:
-        """The chunks, their subjects without repetitions, and the parents that a worker lacks, as `WorkerActor.run`
-        takes them.
+    def of(self, work: Sequence[Work], memory: Memory[int]) -> tuple[Any, ...]:
+        """A work item as `WorkerActor.run` takes it: one message, and the large arrays that a worker lacks.
 
         Args:
-            kept: see `parents_to_send`.
+            memory: see `parcel`.
         """
-        subjects = {id(subject): subject for subject, _ in work}
-        of_recipes = {key: subject for key, subject in subjects.items() if recipes_in(subject) is not None}
-        others = {key: self._subjects.of(subject) for key, subject in subjects.items() if key not in of_recipes}
-        forget_old_subjects(self._subjects)
-        index = {key: number for number, key in enumerate([*of_recipes, *others])}
-        asked = [as_sent(subject) for subject in of_recipes.values()], [(index[id(of)], chunk) for of, chunk in work]
-        parents = self._packed_parents(parents_to_send(work, kept))
-        return pickle.dumps(asked, pickle.HIGHEST_PROTOCOL), *others.values(), *parents
+        arrays, origins, pickled = parcel(work, memory)
+        large = {name: array for name, array in arrays.items() if array.nbytes > IN_CALL_BYTES}
+        for name in large.keys() - self._stored.keys():
+            reference = self._ray.put(_pickled({name: large[name]}))
+            self._stored.add(name, (reference, large[name].nbytes))
+        self._stored.use(large)
+        self._stored.forget_oldest(SENDER_BYTES, spared=large)
+        small = {name: array for name, array in arrays.items() if name not in large}
+        return _pickled((small, origins, pickled)), *(self._stored[name][0] for name in large)
 
     def forget(self) -> None:
         """Forget all that is stored, so that Ray need not keep it."""
-        self._subjects.clear()
-        self._parents.clear()
-
-    def _packed_parents(self, parents: Mapping[bytes, FloatArray | Origin]) -> list[Any]:
-        """Parents by name: for each large one the reference under which Ray has stored it, then the others together,
-        which may be made of the large ones."""
-        large = {
-            name: values
-            for name, values in parents.items()
-            if not isinstance(values, Origin) and values.nbytes > IN_CALL_BYTES
-        }
-        small = {name: values for name, values in parents.items() if name not in large}
-        for name, values in large.items():
-            if name not in self._parents:
-                ref = self._ray.put(pickle.dumps({name: values}, pickle.HIGHEST_PROTOCOL))
-                self._parents.add(name, (ref, values.nbytes))
-        packed = [self._parents[name][0] for name in large]
-        packed += [pickle.dumps(small, pickle.HIGHEST_PROTOCOL)] if small else []
-        self._parents.needed(large)
-        return packed
-
-    def _packed(self, subject: Subject) -> Any:
-        """The subject, pickled, or the reference under which Ray has stored that."""
-        pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
-        return pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+        self._stored.clear()
 
 
 def fault_reason(error: Exception) -> str:
@@ -257,3 +230,7 @@ class Refusals:
 
     def __str__(self) -> str:
         return "; ".join(dict.fromkeys(self._nodes.values()))
+
+
+def _pickled(message: object) -> bytes:
+    return pickle.dumps(message, pickle.HIGHEST_PROTOCOL)

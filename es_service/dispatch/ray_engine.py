@@ -36,9 +36,9 @@ from es_service.dispatch.ray_calls import (
 )
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
-from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
 from es_service.protocol.raised import raised
+from es_service.protocol.sent import LACKS_AGAIN, Memory
 from es_service.protocol.sources import OtherCodeError
 
 MOST_GONE = 64
@@ -154,10 +154,10 @@ class Actors:
         self._compiled: dict[int, set[str]] = {}
         """Worker id -> kinds of chunks for which it was told to compile."""
         self._parent_cache_bytes = spec.parent_cache_bytes
-        self._parents: dict[int, KeptParents[int]] = {}
-        """Worker id -> sizes of the parents of policies that it keeps."""
+        self._memories: dict[int, Memory[int]] = {}
+        """Worker id -> sizes of the arrays that it has."""
         self._lacking: set[tuple[int, Hashable, int]] = set()
-        """Worker, work item and attempt for which the worker has lacked parents once."""
+        """Worker, work item and attempt for which the worker has lacked arrays once."""
         self._refusals = Refusals(on_refusal)
         self._on_report = on_report
         self._gone: dict[int, WorkerPlace] = {}
@@ -173,7 +173,7 @@ class Actors:
             at = self._class.options(**self._where(worker))
             handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
             self._handles[worker], self._compiled[worker] = handle, set()
-            self._parents[worker] = KeptParents(self._parent_cache_bytes, int)
+            self._memories[worker] = Memory(self._parent_cache_bytes, int)
             self._calls[handle.place.remote()] = Call(worker, "place")
             self._calls[handle.build.remote()] = Call(worker, "build")
         except self._ray.exceptions.RayError as error:
@@ -186,7 +186,7 @@ class Actors:
         self._up.discard(worker)
         if worker in self._places:
             self._gone = dict([*self._gone.items(), (worker, self._places[worker])][-MOST_GONE:])
-        for known in (self._places, self._planned, self._compiled, self._parents):
+        for known in (self._places, self._planned, self._compiled, self._memories):
             known.pop(worker, None)
         if (handle := self._handles.pop(worker, None)) is not None:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
@@ -215,7 +215,7 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            arguments, kind = self._arguments.of(work, self._parents[worker]), type(work[0][1]).__name__
+            arguments, kind = self._arguments.of(work, self._memories[worker]), type(work[0][1]).__name__
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = Call(worker, "place")
@@ -305,11 +305,11 @@ class Actors:
         del self._calls[ref]
         if call.what == "run":
             item = call.worker, call.item_id, call.attempt
-            if value is None:  # it lacks parents of policies
+            if value is None:  # it lacks arrays
                 if item in self._lacking:
                     return Failure(*item, LACKS_AGAIN, "")
                 self._lacking.add(item)
-                self._parents[call.worker].clear()
+                self._memories[call.worker].clear()
                 self.send(*item, call.work)
                 return None
             self._lacking.discard(item)
@@ -400,7 +400,7 @@ def ends_of_files(files: Sequence[str], most_bytes: int) -> str:
 
 
 def _read(what: str, value: Any) -> Any:
-    """What a worker has answered to a call, where None of `run` says that it lacks parents of policies. Raises any
+    """What a worker has answered to a call, where None of `run` says that it lacks arrays. Raises any
     exception for a message that no worker of ours sends."""
     match what:
         case "run":

@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 
 from es_service.errors import EvaluationError, StoreError
 from es_service.loop.policies import PolicyWork
-from es_service.protocol.content import NAME, Arrays, as_bytes, name_of, names, policy_content
-from es_service.protocol.kept import Kept
+from es_service.protocol.content import NAME, Arrays, Cache, as_bytes, name_of, names, policy_content
 from es_service.protocol.messages import Centre
 from es_service.protocol.policy_spec import PolicySpec
-from es_service.protocol.recipes import Recipes, remember, unvaried
+from es_service.protocol.recipes import Origin, Recipes, unvaried
 from es_service.search.algorithms.base import PolicyAsk
 from es_service.search.arrays import freeze
 from es_service.search.maps.behaviour_map import NO_TRACE, Elite
 
 RECENT_BYTES = 256 * 2**20
 """Most bytes that are kept of policies that the store has: 400 of an ant with a 256x256 policy are 155 MB."""
+MOST_ORIGINS = 1 << 16
+"""Most policies of which it is known how they were made."""
 
 
 class Named:
@@ -38,6 +39,8 @@ class Named:
         self._known: dict[int, tuple[bytes, bytes]] = {}
         self.contents: dict[bytes, Arrays] = {}
         """Those that have a name."""
+        self.origins: dict[bytes, Origin] = {}
+        """How those of them that were made of recipes were made."""
 
     def names(self, rows: Sequence[int]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Names of the policies of some rows, and of their traces."""
@@ -49,7 +52,7 @@ class Named:
             self._known[row] = self._add(policy), self._add({"trace_T_B": self._trace_N_T_B[row].copy()})
         for work, numbers, rows_here in self._of_subjects(new):
             if isinstance(work, PolicyWork) and isinstance(work.parameters_N_D, Recipes):
-                remember(work.parameters_N_D.part(numbers), [self._known[row][0] for row in rows_here])
+                self.origins |= work.parameters_N_D.part(numbers).origins_of([self._known[row][0] for row in rows_here])
         return names(self._known[row][0] for row in rows), names(self._known[row][1] for row in rows)
 
     def points(self, rows: Sequence[int]) -> dict[int, Centre]:
@@ -86,12 +89,16 @@ class Contents:
             read: returns a content that is stored; raises KeyError if there is none of this name.
         """
         self._read, self._most_bytes = read, most_bytes
-        self._kept: Kept[bytes, Arrays] = Kept(lambda content: sum(array.nbytes for array in content.values()))
+        self._kept: Cache[bytes, Arrays] = Cache(lambda content: sum(array.nbytes for array in content.values()))
         self._newest: Mapping[bytes, Arrays] = {}
+        self._origins: dict[bytes, Origin] = {}
 
-    def add(self, contents: Mapping[bytes, Arrays]) -> None:
-        """Take in those of a new generation. Those of the one before are stored."""
+    def add(self, contents: Mapping[bytes, Arrays], origins: Mapping[bytes, Origin]) -> None:
+        """Take in those of a new generation, and how they were made. Those of the one before are stored."""
         self._newest = contents
+        self._origins |= origins
+        for name in [*self._origins][: max(0, len(self._origins) - MOST_ORIGINS)]:
+            del self._origins[name]
 
     def of(self, wanted: Sequence[bytes]) -> dict[bytes, Arrays]:
         """Contents by their names. Raises KeyError if there is none of one name.
@@ -141,15 +148,15 @@ class Contents:
             if policies.parents:
                 return ask
             known = {name: content["parameters_D"] for name, content in self.of(policies.names).items()}
-            return replace(ask, parameters_N_D=policies.complete(known))
+            return replace(ask, parameters_N_D=policies.complete(known, self._origins))
         if not isinstance(policies, np.ndarray) or policies.dtype != NAME:
             return ask
         wanted = as_bytes(policies)
         contents = self.of(wanted)
         arrays = ("observation_mean_O", "observation_std_O")
         statistics = (np.stack([contents[name][array] for name in wanted]) for array in arrays)
-        recipes = unvaried(policies).complete({name: contents[name]["parameters_D"] for name in contents})
-        return PolicyAsk(recipes, *statistics)
+        known = {name: content["parameters_D"] for name, content in contents.items()}
+        return PolicyAsk(unvaried(policies).complete(known, self._origins), *statistics)
 
 
 def elite_of(content: Arrays, trace: Arrays | None = None) -> Elite:

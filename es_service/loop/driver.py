@@ -208,7 +208,7 @@ def generation(
         members, stepped, (told, named) = yield from _asked(search, state, begun, asked, clock)
         novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(search.config.novelty))
     learned = tell(search.algorithm, stepped, told)
-    policies.add(named.contents)
+    policies.add(named.contents, named.origins)
     clock.lap("seconds_driver")
     correction = yield from correct(search, policies.policies, learned, number)
     clock.lap("seconds_evaluation")

@@ -1,4 +1,5 @@
-"""Arrays by the name of their content: the SHA-256 of their bits. Policies and traces are stored once under their name.
+"""Arrays by the name of their content: the SHA-256 of their bits. Policies and traces are stored once under their name,
+and a `Cache` has the newest of what is known by name.
 
 What refers to them is an array of names, whose type is `NAME`, so that everybody who has the arrays of a state can see
 which contents it names.
@@ -8,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ Contents = Mapping[bytes, Arrays]
 """Name of a content -> its arrays."""
 NAME = np.dtype("V32")
 """Type of an array of names: the bytes of a SHA-256 each."""
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 NO_NAME = bytes(NAME.itemsize)
 """Stands for no name in an array of names."""
 
@@ -66,3 +69,44 @@ def policy_content(
         "observation_std_O": std_O,
         "spec": np.frombuffer(text, np.uint8),
     }
+
+
+class Cache(dict[Key, Value]):
+    """Values by key, in the order in which they were added or used, and the sum of their sizes.
+
+    Only the methods here may change it: those of `dict` do not count bytes.
+    """
+
+    def __init__(self, size_of: Callable[[Value], int]) -> None:
+        """Have nothing yet; `size_of`: bytes of a value."""
+        super().__init__()
+        self._size_of = size_of
+        self.nbytes = 0
+        """Bytes of all values."""
+
+    def add(self, key: Key, value: Value) -> None:
+        """Take a value as the newest, in the place of the one that had this key."""
+        self.forget(key)
+        self[key] = value
+        self.nbytes += self._size_of(value)
+
+    def use(self, keys: Iterable[Key]) -> None:
+        """Make those that are here the newest."""
+        for key in keys:
+            if key in self:
+                self[key] = self.pop(key)
+
+    def forget(self, key: Key) -> None:
+        """Forget a value if it is here."""
+        if key in self:
+            self.nbytes -= self._size_of(self.pop(key))
+
+    def forget_oldest(self, most_bytes: int, spared: Collection[Key] = ()) -> None:
+        """Forget the oldest until at most so many bytes remain, or the oldest is a spared one."""
+        while self.nbytes > most_bytes and (oldest := next(iter(self))) not in spared:
+            self.forget(oldest)
+
+    def clear(self) -> None:
+        """Forget all."""
+        super().clear()
+        self.nbytes = 0

@@ -164,7 +164,7 @@ class WorkerSpec:
     """Whether environments of Gymnasium draw the starts of policies' episodes with the noise of the reset keys, so that
     they are those of a task in JAX; no run does so."""
     parent_cache_bytes: int = 2**28
-    """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
+    """Most bytes of parents that the worker keeps; see `sent.py`."""
     recycle_after_episodes: int | None = None
     """Episodes after which each core of a worker should be a new process; None: any number."""
     memory_bytes: int | None = None
@@ -217,11 +217,6 @@ class Centre:
     observation_std_O: FloatArray
     """Statistics at the start of the generation, or those of the elite with which the block started; 0 and 1 if
     normalisation is off."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the parameters."""
-        return self.parameters_D.nbytes
 
 
 _NOTHING = np.zeros(0, np.float32)

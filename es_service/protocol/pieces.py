@@ -73,8 +73,8 @@ def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
     parts = [part for part in recipes if part is not None]
     if len(parts) == 1:
         return parts[0]
-    of_all = (np.concatenate([getattr(part, name) for part in parts]) for name in ("parent_N_2", "key_N_4"))
-    return Recipes(parts[0].rule, parts[0].names, parts[0].parents, *of_all)
+    of_all = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("parent_N_2", "key_N_4")}
+    return replace(parts[0], **of_all)
 
 
 def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:

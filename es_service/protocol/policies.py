@@ -42,11 +42,6 @@ class Policies:
     domain: Domain = Domain.EVALUATION_RESET
     """Purpose of the episodes, which is part of the addresses of their resets."""
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the parameters, or of the recipes."""
-        return self.parameters_N_D.nbytes
-
 
 @dataclass(frozen=True)
 class PolicyChunk:

@@ -1,7 +1,7 @@
 """Recipes: policies that are made where they are evaluated, of parents and of noise that has an address.
 
 The parameters of a policy that descends from others need not travel: whoever has its parents makes it, with the same
-bits everywhere. Parents are known by their content, and workers keep those that they were sent (`kept_parents.py`).
+bits everywhere. Parents are known by their content, and each is sent to a worker once (`sent.py`).
 Such et al. 2017 (arXiv:1712.06567) encode individuals by the seeds of their noise in this spirit.
 
 Axes: N policies, D policy parameters.
@@ -10,10 +10,9 @@ Axes: N policies, D policy parameters.
 from __future__ import annotations
 
 import hashlib
-import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,6 +63,16 @@ def variation(x: FloatArray, y: FloatArray, keys: Keys, rule: IsoLine) -> FloatA
     return iso
 
 
+class Origin(NamedTuple):
+    """How one policy was made, so that it can be made again wherever its parents are."""
+
+    rule: IsoLine
+    x: bytes
+    y: bytes
+    """Names of its parents."""
+    key_4: Keys
+
+
 @dataclass(frozen=True, eq=False)
 class Recipes:
     """How policies are made, each of two parents."""
@@ -72,38 +81,44 @@ class Recipes:
     names: tuple[bytes, ...]
     """Names of the parents, each of which occurs once."""
     parents: tuple[FloatArray, ...]
-    """Their parameters; empty where they are known by their names: in an ask, and on the way to a worker."""
+    """Their parameters; empty where they are known by their names: in an ask."""
     parent_N_2: NDArray[np.int64]
     """Indices of each policy's parents x and y among the names."""
     key_N_4: Keys
     """Key of the stream of each policy's noise."""
+    origins: Mapping[bytes, Origin] = field(default_factory=dict, repr=False)
+    """How parents, and policies of which they were made, were made themselves, as far as it is known; it never travels
+    with the recipes (`protocol.sent`)."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recipes, (self.rule, self.names, self.parents, self.parent_N_2, self.key_N_4)
 
     def __len__(self) -> int:
         return len(self.parent_N_2)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes without those of the parents."""
-        return self.parent_N_2.nbytes + self.key_N_4.nbytes + NAME_BYTES * len(self.names)
 
     def part(self, of: slice | Sequence[int]) -> Recipes:
         """The recipes of some of the policies, with the parents that these need."""
         used, parent_M_2 = np.unique(self.parent_N_2[of], return_inverse=True)
         names, parents = (tuple(all_[index] for index in used.tolist()) for all_ in (self.names, self.parents))
-        return Recipes(self.rule, names, parents, parent_M_2.reshape(-1, 2), self.key_N_4[of])
+        key_M_4 = self.key_N_4[of]
+        return replace(self, names=names, parents=parents, parent_N_2=parent_M_2.reshape(-1, 2), key_N_4=key_M_4)
 
     def some(self, of: slice) -> Recipes:
         """The recipes of some of the policies, still with the parents of all."""
-        return Recipes(self.rule, self.names, self.parents, self.parent_N_2[of], self.key_N_4[of])
+        return replace(self, parent_N_2=self.parent_N_2[of], key_N_4=self.key_N_4[of])
 
-    def as_sent(self) -> Recipes:
-        """The recipes without the parents' parameters."""
-        return Recipes(self.rule, self.names, (), self.parent_N_2, self.key_N_4)
+    def complete(self, known: Mapping[bytes, FloatArray], origins: Mapping[bytes, Origin]) -> Recipes:
+        """The recipes with the parents' parameters, which are taken from others by their names, and with origins."""
+        return replace(self, parents=tuple(known[name] for name in self.names), origins=origins)
 
-    def complete(self, kept: Mapping[bytes, FloatArray]) -> Recipes:
-        """The recipes with the parents' parameters, which are taken from others by their names."""
-        parents = tuple(kept[name] for name in self.names)
-        return Recipes(self.rule, self.names, parents, self.parent_N_2, self.key_N_4)
+    def origins_of(self, names: Sequence[bytes]) -> dict[bytes, Origin]:
+        """How these policies are made, by their names, so that they need not travel if they become parents."""
+        origins = {
+            name: Origin(self.rule, self.names[x], self.names[y], key_4.copy())
+            for (x, y), key_4, name in zip(self.parent_N_2.tolist(), self.key_N_4, names, strict=True)
+        }
+        # A policy as it is says nothing of how it was made.
+        return {name: origin for name, origin in origins.items() if name not in (origin.x, origin.y)}
 
     def made(self, vary: Variation = variation) -> FloatArray:
         """The parameters of the policies, [N, D].
@@ -147,16 +162,6 @@ def explicit(policies: Sequence[FloatArray | Recipes]) -> FloatArray:
     return np.concatenate([group.made() if isinstance(group, Recipes) else group for group in policies])
 
 
-class Origin(NamedTuple):
-    """How one policy was made, so that it can be made again wherever its parents are."""
-
-    rule: IsoLine
-    x: bytes
-    y: bytes
-    """Names of its parents."""
-    key_4: Keys
-
-
 def recipes_again(origins: Sequence[Origin], parents: Mapping[bytes, FloatArray]) -> Recipes:
     """The recipes of policies by their origins, all of which have the same rule."""
     index = {
@@ -165,37 +170,6 @@ def recipes_again(origins: Sequence[Origin], parents: Mapping[bytes, FloatArray]
     parent_N_2 = np.array([(index[origin.x], index[origin.y]) for origin in origins])
     key_N_4 = np.stack([origin.key_4 for origin in origins])
     return Recipes(origins[0].rule, tuple(index), tuple(parents[name] for name in index), parent_N_2, key_N_4)
-
-
-_ORIGINS: dict[bytes, Origin] = {}
-"""What `remember` has been told lately, by the name of the policy. A name is that of a content, so an entry is true
-wherever it comes from."""
-_CHANGING_ORIGINS = threading.Lock()
-"""Held by a thread that changes these: several runs of one process may each have one."""
-MOST_ORIGINS = 1 << 16
-"""Most entries of these."""
-
-
-def remember(recipes: Recipes, names: Sequence[bytes]) -> None:
-    """Remember how policies were made, so that they need not travel if they become parents.
-
-    Args:
-        names: those of the policies that `recipes` make.
-    """
-    new = {}
-    for (x, y), key_4, name in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, names, strict=True):
-        origin = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())
-        if name not in (origin.x, origin.y):  # a policy as it is says nothing of how it was made
-            new[name] = origin
-    with _CHANGING_ORIGINS:
-        _ORIGINS.update(new)
-        while len(_ORIGINS) > MOST_ORIGINS:
-            del _ORIGINS[next(iter(_ORIGINS))]
-
-
-def origin_of(name: bytes) -> Origin | None:
-    """How a policy was made; None if that is not remembered."""
-    return _ORIGINS.get(name)
 
 
 def recipes_of(

@@ -33,10 +33,10 @@ from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
-from es_service.protocol.kept_parents import KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.messages import EpisodesResult, Work, WorkerSpec
 from es_service.protocol.pieces import together
 from es_service.protocol.policies import POLICIES_TOGETHER, PolicyChunk, slots
+from es_service.protocol.sent import Memory, Received, parcel
 from es_service.protocol.wire import framed
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
@@ -46,7 +46,6 @@ from es_service.store.writer import RunStore
 from tests.helpers import AtTheEnd
 from workers import worker
 from workers.compilable import Compilable
-from workers.parents import Parents
 from workers.rollouts import BACKENDS
 
 FILLING = 50
@@ -63,7 +62,7 @@ class Inventing(AtTheEnd):
 
     def __init__(self, *, counting: bool) -> None:
         self._rng = np.random.default_rng(0)
-        self._workers = [KeptParents(2**28, int) for _ in range(2)] if counting else []
+        self._workers = [Memory(2**28, int) for _ in range(2)] if counting else []
         self.sent_bytes: list[int] = []
 
     def evaluate(self, work):
@@ -98,15 +97,15 @@ class Working(AtTheEnd):
 
         with patch.object(worker, "kinds_of", timed_kinds):
             self._run = timed(worker.make_worker(spec), spent, "rest")
-        self._workers = [(KeptParents(2**28, int), Parents(2**28, made)) for _ in range(2)]
+        self._workers = [(Memory(2**28, int), Received(2**28, made)) for _ in range(2)]
 
     def evaluate(self, work):
         parts = zip(_halves(work), self._workers, strict=True)
         return [result for part, sides in parts if part for result in self._half(part, *sides)]
 
-    def _half(self, work: Sequence[Work], theirs: KeptParents[int], extra: Parents) -> list[Any]:
+    def _half(self, work: Sequence[Work], theirs: Memory[int], received: Received) -> list[Any]:
         frames = timed(_frames, self._spent, "send")(work, theirs)
-        results = self._run(timed(_read, self._spent, "read")(frames, extra))
+        results = self._run(timed(_read, self._spent, "read")(frames, received))
         answer = timed(framed, self._spent, "answer")(results)
         return timed(lambda frame: pickle.loads(frame[8:]), self._spent, "hear")(answer)
 
@@ -116,26 +115,18 @@ def _halves(work: Sequence[Work]) -> list[Sequence[Work]]:
     return [work[:middle], work[middle:]]
 
 
-def _frames(work: Sequence[Work], kept: KeptParents[int]) -> list[bytes]:
+def _frames(work: Sequence[Work], memory: Memory[int]) -> list[bytes]:
     """A work item's messages to a worker, as the engine inline sends them."""
-    work = together(work, POLICIES_TOGETHER)
-    parents = [framed(("parents", some)) for some in apart(parents_to_send(work, kept))]
-    subjects = {id(subject): framed(("subject", id(subject), as_sent(subject))) for subject, _ in work}
-    return [*subjects.values(), *parents, framed(("chunks", [(id(subject), chunk) for subject, chunk in work]))]
+    arrays, origins, pickled = parcel(together(work, POLICIES_TOGETHER), memory)
+    return [*(framed(("arrays", {name: array})) for name, array in arrays.items()), framed(("work", origins, pickled))]
 
 
-def _read(frames: Sequence[bytes], parents: Parents) -> list[Work]:
+def _read(frames: Sequence[bytes], received: Received) -> list[Work]:
     """The work item of messages, with the parents of its policies."""
-    subjects, work = {}, []
-    for frame in frames:
-        match pickle.loads(frame[8:]):
-            case ("subject", number, subject):
-                subjects[number] = subject
-            case ("parents", given):
-                parents.receive(given)
-            case ("chunks", chunks):
-                work = [(subjects[number], chunk) for number, chunk in chunks]
-    return parents.complete(work)
+    *arrays, (_, origins, pickled) = [pickle.loads(frame[8:]) for frame in frames]
+    for _, named in arrays:
+        received.add(named)
+    return received.work(origins, pickled)
 
 
 def timed(function: Callable[..., Any], spent: dict[str, float], name: str) -> Callable[..., Any]:

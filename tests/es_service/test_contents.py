@@ -66,9 +66,9 @@ def test_a_policy_larger_than_the_room_is_read_each_time(store):
 
 def test_those_of_the_newest_generation_need_not_be_stored_yet(store):
     contents = Contents(store.content)
-    contents.add({bytes([9]): content(9)})
+    contents.add({bytes([9]): content(9)}, {})
     assert values(contents, 0, 9) == [0, 9]
-    contents.add({})
+    contents.add({}, {})
     assert values(contents, 9) == [9]
     assert store.read == [0]
     with pytest.raises(KeyError):

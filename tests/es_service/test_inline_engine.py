@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 from contextlib import ExitStack
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,12 @@ from es_service.dispatch.engine import Answer
 from es_service.dispatch.events import Limits, Placed, Progress, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import kept_subjects
 from es_service.protocol.child import Child, socket_pair
-from es_service.protocol.kept import Kept
-from es_service.protocol.kept_subjects import KEPT_SUBJECTS, forget_old_subjects
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError
+from es_service.protocol.recipes import Recipes
+from es_service.protocol.sent import LEAST_BYTES, Received
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 
@@ -52,71 +50,68 @@ def transport():
 
 
 class Receiver:
-    """A worker's side of a socket, as in workers/process.py: the centres that it keeps, and what it was sent."""
+    """A worker's side of a socket, as in workers/process.py: the centres that it has, and how many it was sent."""
 
-    def __init__(self, end: socket.socket) -> None:
-        self.end, self.received = end, 0
-        self.centres = Kept(attrgetter("nbytes"))
+    def __init__(self, end: socket.socket, most_bytes: int = 2**40) -> None:
+        self.end, self.received, self.sent = end, Received(most_bytes, Recipes.made), 0
 
     def item(self) -> list[tuple[float, int]]:
         """(first parameter of the centre, id) of each chunk of the next work item."""
-        while (said := receive(self.end))[0] == "subject":
-            _, number, point = said
-            self.centres.add(number, point)
-            self.received += 1
-        found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
-        forget_old_subjects(self.centres)
-        return found
+        while (said := receive(self.end))[0] == "arrays":
+            self.received.add(said[1])
+            self.sent += len(said[1])
+        return [(float(centre.parameters_D[0]), chunk.chunk_id) for centre, chunk in self.received.work(*said[3:])]
 
 
-POINTS = [centre(np.array([number], np.float32)) for number in range(200)]
+POINTS = [centre(np.full(LEAST_BYTES // 4, number, np.float32)) for number in range(200)]
 
 
 def work_of(*numbers: int) -> list[Work]:
     return [(POINTS[number], TrainingChunk(3, position)) for position, number in enumerate(numbers)]
 
 
-def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_was_forgotten(transport):
+def test_a_centre_is_sent_once_for_items_one_after_another_and_a_worker_has_no_older_ones(transport):
     transport, (end, other) = transport
     worker, second = Receiver(end), Receiver(other)
-    for numbers, received in (
+    for numbers, sent in (
         ([0], 1),
         ([0], 1),
         ([0, 1, 0], 2),
         ([2, 1], 3),
-        (range(3, KEPT_SUBJECTS), 64),
-        ([0], 64),  # still there
-        ([64], 65),
-        ([1], 65),
-        ([0], 66),  # the oldest of 65 was forgotten
-        (range(100), 66 + 36),  # those that are still there at the start of a message are not sent again
+        ([0], 4),  # it was forgotten with the item before, and now the others are
+        ([1], 5),
+        (range(100), 104),
+        ([7], 104),
     ):
         transport.send(0, "key", 1, work_of(*numbers))
         assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
-        assert worker.received == received
-        assert len(worker.centres) <= KEPT_SUBJECTS
+        assert worker.sent == sent
+        assert len(worker.received.memory) == len({*numbers})
     transport.send(1, "key", 1, work_of(99, 98))  # what one worker has, another may not have
     assert second.item() == [(99, 0), (98, 1)]
-    assert second.received == 2
+    assert second.sent == 2
 
 
-def test_of_large_centres_a_worker_keeps_as_many_as_fit_and_always_one(transport, monkeypatch):
-    monkeypatch.setattr(kept_subjects, "KEPT_BYTES", 400)
+def test_a_small_centre_travels_with_its_item(transport):
     transport, (end, _) = transport
-    worker, sizes = Receiver(end), {0: 50, 1: 50, 2: 25, 3: 101}
-    points = {number: centre(np.full(size, number, np.float32)) for number, size in sizes.items()}
-    for numbers, received, kept in (
-        ([0, 1], 2, 2),
-        ([2, 1], 3, 2),  # 0 made room
-        ([0], 4, 2),  # and 1 for it
-        ([3, 3, 2], 5, 1),  # too large to be kept with another
-        ([3], 5, 1),
-        ([3, 3], 5, 1),  # the newest stays, however large
-    ):
-        work = [(points[number], TrainingChunk(3, position)) for position, number in enumerate(numbers)]
-        transport.send(0, "key", 1, work)
-        assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
-        assert (worker.received, len(worker.centres)) == (received, kept)
+    worker = Receiver(end)
+    for _ in range(2):
+        transport.send(0, "key", 1, with_subject(centre(np.full(LEAST_BYTES // 4 - 1, 5.0, np.float32)), CHUNKS))
+        assert worker.item() == [(5.0, 0), (5.0, 1)]
+    assert (worker.sent, len(worker.received.memory)) == (0, 0)
+
+
+def test_a_message_with_an_array_is_made_once_while_it_is_new(transport, monkeypatch):
+    monkeypatch.setattr(inline_module, "SENDER_BYTES", 3 * LEAST_BYTES)
+    made = []
+    monkeypatch.setattr(inline_module, "framed", lambda message: made.append(message[0]) or framed(message))
+    transport, ends = transport
+    workers = [Receiver(end) for end in ends]
+    for numbers, count in (([0, 1], 2), ([0], 2), ([2], 3), ([0], 4)):
+        for at, worker in enumerate(workers):
+            transport.send(at, "key", 1, work_of(*numbers))
+            assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
+        assert made.count("arrays") == count
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -126,7 +121,7 @@ def test_a_worker_always_has_the_centres_of_its_chunks(transport, seed):
     rng, workers = random.Random(seed), [Receiver(end) for end in ends]
     waiting = [[], []]
     for _ in range(150):
-        low, size = rng.randrange(200), rng.choice([1, 2, 5, 70])
+        low, size = rng.randrange(200), rng.choice([1, 2, 5])
         numbers = [(low + rng.randrange(90)) % 200 for _ in range(size)]
         at = rng.randrange(2)
         transport.send(at, "key", 1, work_of(*numbers))
@@ -134,7 +129,7 @@ def test_a_worker_always_has_the_centres_of_its_chunks(transport, seed):
         for worker, items in zip(workers, waiting, strict=True):
             while len(items) > rng.randrange(3):
                 assert worker.item() == items.pop(0)
-    assert min(worker.received for worker in workers) > 200, "most of them more than once"
+    assert min(worker.sent for worker in workers) > 100, "most of them more than once"
 
 
 LARGE = np.arange(1_000_000)
@@ -251,7 +246,7 @@ def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, m
 def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):
     transport, ends = transport
     for key in range(40):
-        transport.send(0, key, 1, with_subject(centre(np.zeros(100_000, np.float32)), CHUNKS[:1]))
+        transport.send(0, key, 1, with_subject(centre(np.full(100_000, key, np.float32)), CHUNKS[:1]))
     assert transport._workers[0].channel.is_full
     ends[0].shutdown(socket.SHUT_WR)
     assert isinstance(transport.receive(1.0), WorkerLost)

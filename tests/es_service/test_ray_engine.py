@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from es_service.dispatch import ray_calls, waits
 from es_service.dispatch import ray_engine as ray_engine_module
-from es_service.dispatch import waits
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import (
     Compiled,
@@ -30,8 +30,9 @@ from es_service.dispatch.ray_calls import IN_CALL_BYTES, Looks
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.kept_subjects import KEPT_SUBJECTS
-from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, with_subject
+from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, Work, with_subject
+from es_service.protocol.recipes import Recipes
+from es_service.protocol.sent import LEAST_BYTES, Received
 from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters
 
@@ -151,13 +152,23 @@ class PretendedRay:
         excluded = self.node_of(index) in str(self.selectors[-1])
         actor = Actor(index, "alive" if placed < self.room and not excluded else "pending")
         self.actors.append(actor)
+        received = Received(2**40, Recipes.made)
+
+        def work(item: bytes, *stored: int) -> list[Work]:
+            small, origins, pickled = pickle.loads(item)
+            for arrays in (small, *(pickle.loads(self.stored[one]) for one in stored)):
+                received.add(arrays)
+            return received.work(origins, pickled)
+
+        def compile(*item: Any) -> float:
+            self.compiled.append((actor.number, type(work(*item)[0][1]).__name__))
+            return 0.0
+
         methods = {
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
-            "compile": lambda chunks, *centres: 0.0,
-            "run": lambda chunks, *centres: pickle.dumps(
-                ([f"of {chunk}" for _, chunk in pickle.loads(chunks)[1]], actor.report)
-            ),
+            "compile": compile,
+            "run": lambda *item: pickle.dumps(([f"of {chunk}" for _, chunk in work(*item)], actor.report)),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
         looked = SimpleNamespace(
@@ -172,8 +183,6 @@ class PretendedRay:
             actor.owed.append(ref)
             if name == "run":
                 self.calls.append(arguments)
-            if name == "compile":
-                self.compiled.append((actor.number, type(pickle.loads(arguments[0])[1][0][1]).__name__))
             if name == "build" and self.node_of(actor.number) in self.refusing:
                 ref.error = OtherCodeRayTaskError(f"{self.node_of(actor.number)} has other code: a.py")
             if name == "run" and actor.state == "alive":
@@ -564,33 +573,25 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
         assert engine.counts.lost_workers == 4
 
 
-@pytest.mark.parametrize("size", [1, IN_CALL_BYTES // 4])
-def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_while_it_is_new(size):
-    ray = PretendedRay()
-    points = [centre(np.full(size, number)) for number in range(KEPT_SUBJECTS + 2)]
+@pytest.mark.parametrize("size", [LEAST_BYTES // 4, IN_CALL_BYTES // 4 + 1])
+def test_a_centre_is_sent_once_to_an_actor_and_a_large_one_is_stored_once_while_it_is_new(size, monkeypatch):
+    monkeypatch.setattr(ray_calls, "SENDER_BYTES", 3 * 4 * size)
+    ray, points = PretendedRay(), [centre(np.full(size, number, np.float32)) for number in range(5)]
 
-    def evaluate(*numbers: int) -> int:
-        """Evaluates chunks of these centres; returns how many values were stored for that."""
+    def evaluate(*numbers: int) -> tuple[int, int]:
+        """Evaluates chunks of these centres; returns how many arrays were sent and how many stored for that."""
         work = [(points[number], TrainingChunk(3, number, position)) for position, number in enumerate(numbers)]
         stored = len(ray.stored)
         ray.calls.clear()
         assert engine.evaluate(work) == [f"of {chunk}" for _, chunk in work]
-        for packed, *centres in ray.calls:
-            known = [pickle.loads(ray.stored[one] if isinstance(one, int) else one) for one in centres]
-            chunks = pickle.loads(packed)[1]
-            assert [known[index].parameters_D[0] for index, _ in chunks] == [chunk.chunk_id for _, chunk in chunks]
-            assert sorted({index for index, _ in chunks}) == list(range(len(known)))
-            assert len({one.parameters_D[0] for one in known}) == len(known)
-        return len(ray.stored) - stored
+        sent = [len(large) + len(pickle.loads(item)[0]) for item, *large in ray.calls]
+        return sum(sent), len(ray.stored) - stored
 
-    with ray_engine(ray, Limits(2, item_s=60.0)) as engine:
-        found = [evaluate(0) for _ in range(3)]  # so that it is known how long a chunk takes
-        found += [evaluate(0, 1, 1, 0), evaluate(*range(KEPT_SUBJECTS)), evaluate(0, 1), evaluate(KEPT_SUBJECTS)]
-        found += [evaluate(1, 2), evaluate(0)]  # the oldest was forgotten
-        evaluate(1, 2, 3, 2)
-        assert max(len(centres) for _, *centres in ray.calls) > 1
-    large = [1, 0, 0, 1, KEPT_SUBJECTS - 2, 0, 1, 0, 1]
-    assert found == ([0] * 9 if size == 1 else large)
+    with ray_engine(ray, Limits(1, item_s=60.0)) as engine:
+        found = [evaluate(*numbers) for numbers in ([0], [0], [0, 1, 1, 0], [1, 2], [0], [3], [0], [4, 1])]
+    sent = [1, 0, 1, 1, 1, 1, 1, 2]  # a centre that an item does not need is sent with a later one again
+    stored = [1, 0, 1, 1, 0, 1, 0, 2] if size > IN_CALL_BYTES // 4 else [0] * 8
+    assert found == [*zip(sent, stored, strict=True)]
 
 
 def test_an_actor_is_asked_how_far_it_is_with_a_call_that_takes_long():

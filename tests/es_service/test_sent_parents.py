@@ -29,12 +29,12 @@ from es_service.protocol.messages import Work
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
+from es_service.protocol.sent import Received
 from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import spec
 from workers import process
 from workers.actor import WorkerActor
 from workers.compilable import Compilable
-from workers.parents import Parents
 from workers.reports import Reports
 
 PARENTS, WORKERS = 60, 2
@@ -97,9 +97,9 @@ class Threads(inline_module.ChildProcesses):
         self._ready.append(Placed(worker))
 
     def send(self, worker, item_id, attempt, work):
-        before = set(self._workers[worker].parents)
+        before = set(self._workers[worker].memory)
         super().send(worker, item_id, attempt, work)
-        self.sent.append([name for name in self._workers[worker].parents if name not in before])
+        self.sent.append([name for name in self._workers[worker].memory if name not in before])
 
 
 class ActorsHere(PretendedRay):
@@ -112,7 +112,7 @@ class ActorsHere(PretendedRay):
     def _start(self, spec: bytes, index: int, gpus: float, cores: int) -> Any:
         found, actor = super()._start(spec, index, gpus, cores), WorkerActor(spec, index)
         actor._run_chunks = COMPUTING
-        actor._parents = Parents(self.theirs, Recipes.made)
+        actor._received = Received(self.theirs, Recipes.made)
         actor._reports = Reports(SPEC)
 
         def remote(name: str) -> SimpleNamespace:
@@ -140,9 +140,9 @@ def ray(sender: int, worker: int) -> Iterator[tuple[Engine, Any]]:
     )
 
     def sent() -> list[bytes]:
-        parts = [part for call in pretended.calls for part in call[1:]]
-        found = [pickle.loads(pretended.stored[part] if isinstance(part, int) else part) for part in parts]
-        return [name for one in found if isinstance(one, dict) for name in one]
+        small = [pickle.loads(item)[0] for item, *_ in pretended.calls]
+        large = [pickle.loads(pretended.stored[one]) for _, *stored in pretended.calls for one in stored]
+        return [name for arrays in (*small, *large) for name in arrays]
 
     with Engine(transport, LIMITS) as engine:
         yield engine, sent
@@ -178,7 +178,7 @@ def test_a_large_parent_is_stored_once_for_all_actors_and_a_small_one_never():
                 names |= {name for subject, _ in work for name in subject.parameters_N_D.names}
         assert len(pretended.stored) == (len(names) if is_stored else 0)
         if not is_stored:
-            assert max(map(len, pretended.calls)) == 2, "the policies of all chunks are one argument, and their parents"
+            assert max(map(len, pretended.calls)) == 1, "the policies of all chunks and their parents are one argument"
 
 
 @pytest.mark.parametrize("keeps", [1, 20, 40])
@@ -211,7 +211,7 @@ def test_a_worker_that_lacks_what_it_was_just_sent_has_failed(engine, monkeypatc
     generations = Generations(10)
     with engine(2**40, 2**40) as (evaluator, _):
         evaluator.evaluate(generations.next())
-        monkeypatch.setattr(Parents, "receive", lambda self, parents: None)
+        monkeypatch.setattr(Received, "add", lambda self, arrays: None)
         with pytest.raises(EvaluationError, match="though it was sent all of them"):
             evaluator.evaluate(generations.next(new=PARENTS))
 

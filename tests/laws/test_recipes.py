@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import pickle
 import random
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +12,6 @@ import pytest
 
 from es_service.errors import EvaluationError
 from es_service.loop.policies import no_statistics, policy_work
-from es_service.protocol.kept_parents import (
-    LEAST_BYTES,
-    KeptParents,
-    LackingError,
-    as_sent,
-    parents_to_send,
-    with_made_policies,
-    with_parents,
-)
 from es_service.protocol.messages import Policies, with_subject
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
@@ -31,17 +20,16 @@ from es_service.protocol.recipes import (
     Origin,
     Recipes,
     name_of,
-    origin_of,
     recipes_again,
     recipes_of,
-    remember,
     unvaried,
     variation,
 )
+from es_service.protocol.sent import LEAST_BYTES, LackingError, Memory, Received, parcel
 from es_service.search.algorithms.base import PolicyAsk
 from tests.laws.me_es_runs import SHAPE, config_of, run_in_memory
 from tests.laws.test_policies import only
-from workers.parents import Parents
+from workers.cores import with_made_policies
 
 RULE = IsoLine(0.3, 0.6)
 SIZE = SHAPE.parameters
@@ -124,15 +112,13 @@ def test_an_array_that_cannot_change_is_hashed_once(monkeypatch):
 # What travels
 
 
-def test_no_parameters_travel_with_a_subject():
-    (subject, _) = work_of(POLICY_SLOTS)[0]
-    sent = pickle.loads(data := pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL))
-    assert sent.parameters_N_D.parents == ()
-    assert len(data) < 3000 < PARENTS[0].nbytes * 20
-    assert subject.nbytes < 1500
-    assert bits(sent.parameters_N_D.complete(dict(zip(map(name_of, PARENTS), PARENTS, strict=True))).made()) == bits(
-        subject.parameters_N_D.made()
-    )
+def test_no_parameters_travel_with_an_item():
+    work = work_of(POLICY_SLOTS)
+    sent = parcel(work, Memory(2**40, int))
+    assert len(sent.work) < 3000 < PARENTS[0].nbytes * 20
+    received = Received(2**40, Recipes.made)
+    received.add(dict(zip(map(name_of, PARENTS), PARENTS, strict=True)))
+    assert made(received.work({}, sent.work)) == made(work)
 
 
 def test_statistics_travel_only_if_there_are_any():
@@ -148,18 +134,17 @@ class Worker:
 
     def __init__(self, most_parents: int, theirs: int | None = None) -> None:
         limit = PARENTS[0].nbytes
-        self.known: KeptParents[int] = KeptParents(most_parents * limit, int)
-        self.parents = Parents((theirs or most_parents) * limit, Recipes.made)
-        self.kept = self.parents.kept
-        self.received: list[bytes | Origin] = []
+        self.known: Memory[int] = Memory(most_parents * limit, int)
+        self.received = Received((theirs or most_parents) * limit, Recipes.made)
+        self.kept = self.received.memory
+        self.sent: list[bytes | Origin] = []
         """The names of parents that it was sent, or their origins."""
 
     def item(self, work):
-        sent = parents_to_send(work, self.known)
-        self.received += [given if isinstance(given, Origin) else name for name, given in sent.items()]
-        self.parents.receive(pickle.loads(pickle.dumps(sent)))
-        subjects = {id(subject): pickle.loads(pickle.dumps(as_sent(subject))) for subject, _ in work}
-        return self.parents.complete([(subjects[id(subject)], chunk) for subject, chunk in work])
+        arrays, origins, pickled = parcel(work, self.known)
+        self.sent += [*arrays, *origins.values()]
+        self.received.add(arrays)
+        return self.received.work(pickle.loads(pickle.dumps(origins)), pickled)
 
 
 def test_a_parent_travels_once_while_it_is_kept():
@@ -167,7 +152,7 @@ def test_a_parent_travels_once_while_it_is_kept():
     for _ in range(3):
         assert made(worker.item(work)) == made(work)
     names = [name for subject, _ in work for name in subject.parameters_N_D.names]
-    assert worker.received == list(dict.fromkeys(names))
+    assert worker.sent == list(dict.fromkeys(names))
 
 
 @pytest.mark.parametrize("most", [1, 12, 25])
@@ -183,7 +168,7 @@ def test_with_any_limit_a_worker_has_what_its_sender_believes_and_keeps_no_more(
         assert needed <= set(worker.kept)
         assert len(worker.kept) <= max(most, len(needed))
         sent += len(needed)
-    assert 40 < len(worker.received) < sent
+    assert 40 < len(worker.sent) < sent
 
 
 def test_a_worker_that_lacks_parents_says_so_and_computes_when_it_is_sent_all_again():
@@ -212,23 +197,23 @@ def test_what_a_sender_does_not_know_of_is_forgotten_first():
         assert set(worker.known) <= set(worker.kept)
 
 
-def born(work, number):
+def born(work, number, origins):
     """One of the policies that are asked for, whose origin is then known."""
     parameters_D = work.policies([number])[0].parameters_D
-    remember(work.parameters_N_D.part([number]), [name_of(parameters_D)])
+    origins |= work.parameters_N_D.part([number]).origins_of([name_of(parameters_D)])
     return parameters_D
 
 
 def descendants(generations: int, size: int, policies: int = 32):
     """Work of generations in which a few policies of each take the places of parents, as elites do."""
-    rng = np.random.default_rng(size)
+    rng, origins = np.random.default_rng(size), {}
     parents = [rng.normal(size=size).astype(np.float32) for _ in range(20)]
     for generation in range(generations):
-        asked = recipes(policies, generation, parents=parents)
+        asked = replace(recipes(policies, generation, parents=parents), origins=origins)
         work = policy_work(asked, no_statistics(policies, 2), 1, seed=0, generation=generation)
         yield work.work
         for number in rng.integers(policies, size=2).tolist():
-            parents[rng.integers(len(parents))] = born(work, number)
+            parents[rng.integers(len(parents))] = born(work, number, origins)
 
 
 @pytest.mark.parametrize("most", [1, 15, 1000])
@@ -240,9 +225,9 @@ def test_of_a_parent_that_was_made_of_others_only_the_origin_travels(most):
         for worker, item in ((one, work[:1]), (other, work[1:])):
             assert made(worker.item(item)) == made(item)
             assert list(worker.kept) == list(worker.known)
-    origins = [sum(isinstance(given, Origin) for given in worker.received) for worker in (one, other)]
+    origins = [sum(isinstance(given, Origin) for given in worker.sent) for worker in (one, other)]
     if most == 1000:
-        assert all(len(worker.received) - count < 25 for worker, count in zip((one, other), origins, strict=True))
+        assert all(len(worker.sent) - count < 25 for worker, count in zip((one, other), origins, strict=True))
         assert min(origins) > 40
     assert max(origins) > 0
 
@@ -250,48 +235,29 @@ def test_of_a_parent_that_was_made_of_others_only_the_origin_travels(most):
 def test_parents_that_a_worker_lacks_are_made_after_what_they_are_made_of():
     """It has the first two. Of their children and grandchildren it hears with the first item of these."""
     parents = list(np.random.default_rng(0).normal(size=(2, 2000)).astype(np.float32))
-    worker = Worker(1000)
+    worker, origins = Worker(1000), {}
     for generation in range(3):
-        asked = recipes(4, generation, parents=parents)
+        asked = replace(recipes(4, generation, parents=parents), origins=origins)
         work = policy_work(asked, no_statistics(4, 2), 1, seed=0, generation=generation)
         if generation != 1:
             assert made(worker.item(work.work)) == made(work.work)
-        parents = [born(work, number) for number in range(2)]
-    assert [isinstance(given, Origin) for given in worker.received] == [False] * 2 + [True] * 4
+        parents = [born(work, number, origins) for number in range(2)]
+    assert [isinstance(given, Origin) for given in worker.sent] == [False] * 2 + [True] * 4
 
 
 def test_a_small_parent_travels_itself():
     worker = Worker(1000)
     for work in descendants(10, LEAST_BYTES // 4 - 1):
         assert made(worker.item(work)) == made(work)
-    assert not any(isinstance(given, Origin) for given in worker.received)
+    assert not any(isinstance(given, Origin) for given in worker.sent)
 
 
 def test_a_policy_has_the_origin_of_which_it_was_made():
     asked = recipes(5, 77)
-    assert origin_of(name_of(asked.made()[3])) is None
-    remember(asked, [*map(name_of, asked.made())])
-    origin = origin_of(name_of(asked.made()[3]))
-    assert isinstance(origin, Origin)
+    name = name_of(asked.made()[3])
+    origin = asked.origins_of([*map(name_of, asked.made())])[name]
     known = dict(zip(asked.names, asked.parents, strict=True))
     assert bits(recipes_again([origin], known).made()[0]) == bits(asked.made()[3])
-
-
-def test_threads_that_remember_at_once_keep_the_newest_origins(monkeypatch):
-    """As two runs of one process do: each forgets the oldest entries, which another may have forgotten just now."""
-    monkeypatch.setattr("es_service.protocol.recipes.MOST_ORIGINS", 20)
-    asked = [recipes(100, seed) for seed in range(8)]
-    made = [[*map(name_of, one.made())] for one in asked]
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(8) as threads:
-            for _ in range(10):
-                assert [*threads.map(remember, asked, made)] == [None] * 8
-    finally:
-        sys.setswitchinterval(interval)
-    remember(asked[0], made[0])
-    assert [origin_of(name) is not None for name in made[0]] == [False] * 80 + [True] * 20
 
 
 def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
@@ -301,8 +267,7 @@ def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
     made_N_D = recipes.made()
     np.testing.assert_array_equal(made_N_D, policies)
     assert recipes.names == tuple(map(name_of, made_N_D))
-    remember(recipes, recipes.names)
-    assert all(origin_of(name) is None for name in recipes.names)
+    assert recipes.origins_of(recipes.names) == {}
 
 
 def test_a_worker_whose_cores_are_processes_gives_them_the_policies():
@@ -312,7 +277,6 @@ def test_a_worker_whose_cores_are_processes_gives_them_the_policies():
     assert found[0][0] is not work[0][0]
     explicit = with_subject(found[0][0], [PolicyChunk(1, 0), PolicyChunk(1, 1)])
     assert with_made_policies(explicit) == explicit
-    assert with_parents(explicit, KeptParents(0, int)) == explicit
 
 
 # What is refused

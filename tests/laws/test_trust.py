@@ -16,6 +16,7 @@ UNPICKLERS = {
     "es_service.protocol.wire": "messages between the driver and its own child processes",
     "es_service.dispatch.ray_engine": "answers of the workers in the cluster",
     "es_service.runs.scaling": "what it pickled itself, to measure how long it takes",
+    "es_service.protocol.sent": "work from the driver",
     "workers.actor": "messages of the driver",
 }
 """Module that unpickles -> what; each has it from a process of ours or from the cluster, and none from a run folder."""

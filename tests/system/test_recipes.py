@@ -78,7 +78,7 @@ def test_a_run_that_goes_on_with_ray(tmp_path, reference, monkeypatch):
         sent[key] += 1
         if key.kind == "PolicyChunk" and key.generation in (SWITCH + 1, SWITCH + 3) and sent[key] == 1:
             for name in [name for subject, _ in work for name in subject.parameters_N_D.names]:
-                self._parents[worker].add(name, 1)
+                self._memories[worker].add(name, 1)
         send(self, worker, key, attempt, work)
 
     monkeypatch.setattr(Actors, "send", send_in_vain)

@@ -91,16 +91,16 @@ if __name__ == "__main__":
 
     def item(value):
         subject = centre(np.full(1, value), observation_size=0)
-        return pickle.dumps(([], [(0, EvaluationChunk(1, 0))])), pickle.dumps(subject)
+        return pickle.dumps(({}, {}, pickle.dumps([(subject, EvaluationChunk(1, 0))])))
 
     with ThreadPoolExecutor(2) as calls:
-        first = calls.submit(actor.run, *item(1.0))
+        first = calls.submit(actor.run, item(1.0))
         while not Path(sys.argv[1], "begun").exists():
             time.sleep(0.01)
         hangs = actor.progress()
         time.sleep(0.1)
         assert actor.progress() == hangs, "it waits"
-        second = calls.submit(actor.run, *item(-1.0))
+        second = calls.submit(actor.run, item(-1.0))
         fitness = [pickle.loads(call.result())[0][0].fitness for call in (first, second)]
     assert actor.progress() != hangs
     assert np.array_equal(fitness, np.full_like(fitness, 1.0) * [[1.0], [-1.0]]), fitness
@@ -126,8 +126,8 @@ if __name__ == "__main__":
     given = replace(drift(), environment=f"python:{MODULE}:Loud", output_bytes=200_000)
     actor = WorkerActor(pickle.dumps(given), 0, cores=int(sys.argv[1]))
     actor.build()
-    chunks = [(0, TrainingChunk(1, chunk)) for chunk in range(6)]
-    actor.run(pickle.dumps(([], chunks)), pickle.dumps(centre_of(given)))
+    centre = centre_of(given)
+    actor.run(pickle.dumps(({}, {}, pickle.dumps([(centre, TrainingChunk(1, chunk)) for chunk in range(6)]))))
     time.sleep(0.1)
     os.write(1, b"the last line\\n")
     os.kill(os.getpid(), 9)

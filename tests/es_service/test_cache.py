@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from es_service.protocol.kept import Kept
+from es_service.protocol.content import Cache
 
 
 def arrays(kilobytes, value=0.0):
@@ -10,7 +10,7 @@ def arrays(kilobytes, value=0.0):
 
 
 def test_parts_not_asked_for_the_longest_are_forgotten_when_there_are_too_many_bytes():
-    recent = Kept(lambda part: sum(values.nbytes for values in part.values()))
+    recent = Cache(lambda part: sum(values.nbytes for values in part.values()))
 
     def add(name, kilobytes, **limits):
         recent.add(name, arrays(kilobytes))
@@ -27,4 +27,3 @@ def test_parts_not_asked_for_the_longest_are_forgotten_when_there_are_too_many_b
     recent.forget("small")
     assert add("other", 2) == ["other"], "what is forgotten needs no room"
     assert add("other", 3) == ["other"], "nor what is replaced"
-    assert [add(name, 0, most=2) for name in "xy"][-1] == ["x", "y"]
