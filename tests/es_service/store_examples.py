@@ -11,12 +11,15 @@ import numpy as np
 
 from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.loop.history import NO_INTEGER, Column
+from es_service.protocol.content import NO_NAME, name_of, names, names_in
 from es_service.store import upkeep as store_upkeep
+from es_service.store.codec import decode_part
 from es_service.store.connection import reading
 from es_service.store.digest import digest_of, digest_parts
 from es_service.store.facts import Damaged
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_evaluations, read_history, read_parts
+from es_service.store.states import sound_content
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
 from workers.environments import SHIPPED
@@ -63,8 +66,9 @@ def meta(**changes):
 
 
 def parts_of(generation, seed=0):
-    """The parts that this generation changes: the statistics, one centre of three (all of them at first), and a guest
-    that comes with generations 1, 5, 9, ... and goes with 3, 7, ...; None for a part that goes."""
+    """The parts that this generation changes: the statistics, one centre of three (all of them at first), the names of
+    the policies of three cells, and of the best one every fourth generation, and a guest that comes with generations 1,
+    5, 9, ... and goes with 3, 7, ...; None for a part that goes."""
     centres = range(CENTRES) if generation == 0 else [generation * 7 % 5 % CENTRES]
     parts = {f"centre_{centre}": _centre(seed, generation, centre) for centre in centres}
     parts["observations"] = {
@@ -72,9 +76,25 @@ def parts_of(generation, seed=0):
         "mean_O": np.random.default_rng([seed, generation, 99]).standard_normal(5),
         "steps": np.asarray(generation, np.int64),
     }
+    newest = [max((at for at in range(generation + 1) if at % 3 == cell), default=None) for cell in range(3)]
+    parts["map"] = {"policy_N": names(NO_NAME if at is None else name_of(policy(at, seed)) for at in newest)}
+    if generation % 4 == 0:
+        parts["best"] = {"policy": names([name_of(policy(generation, seed))])[0]}
     if generation % 2:
         parts["guest"] = {"x": np.full(9, generation)} if generation % 4 == 1 else None
     return parts
+
+
+def policy(generation, seed=0):
+    """The policy that a generation adds; of seven, so that one that nothing names any more comes back."""
+    values = np.random.default_rng([seed, generation * 5 % 7, 77]).standard_normal(40)
+    return {"parameters_D": values.astype(np.float32)}
+
+
+def contents_of(generation, seed=0):
+    """What a generation's parts name, as far as they are new."""
+    content = policy(generation, seed)
+    return {name_of(content): content}
 
 
 def _centre(seed, generation, centre):
@@ -92,6 +112,13 @@ def state_at(generation, seed=0):
     for at in range(generation + 1):
         state.update(parts_of(at, seed))
     return {name: part for name, part in state.items() if part is not None}
+
+
+def named_at(generation):
+    """The contents that the state of a generation names."""
+    names_N = frozenset().union(*map(names_in, state_at(generation).values()))
+    contents = {name: content for at in range(generation + 1) for name, content in contents_of(at).items()}
+    return {name: contents[name] for name in names_N}
 
 
 def history_row(generation):
@@ -143,7 +170,10 @@ def advance(store, last, *, seed=0):
     """Commit generations up to and including `last`."""
     first = 0 if store.generation is None else store.generation + 1
     for generation in range(first, last + 1):
-        store.commit(generation, parts_of(generation, seed), history_row(generation), evaluated_table(generation))
+        contents = contents_of(generation, seed)
+        store.commit(
+            generation, parts_of(generation, seed), history_row(generation), evaluated_table(generation), contents
+        )
 
 
 def finished(folder, generations, seed=0):
@@ -166,6 +196,17 @@ def assert_same_state(found, expected):
             assert found[part][name].dtype == array.dtype
             assert found[part][name].shape == array.shape
             assert found[part][name].tobytes() == array.tobytes(), (part, name)
+
+
+def assert_policies(folder, generation):
+    """The policies that this generation's state names are there, and all that are there are named by a state row."""
+    expected = {name: content for at in range(7) for name, content in contents_of(at).items()}
+    with reading(folder) as (connection, _):
+        stored = {name for (name,) in connection.execute("SELECT name FROM content")}
+        rows = [decode_part(payload) for (payload,) in connection.execute("SELECT payload FROM state") if payload]
+        assert named_at(generation).keys() <= stored == frozenset().union(*map(names_in, rows))
+        for name in stored:
+            assert_same_state({"": sound_content(connection, name)}, {"": expected[name]})
 
 
 def assert_same_history(found, generations):
@@ -213,6 +254,7 @@ def assert_sound(folder, generation):
     assert_same_evaluations(read_evaluations(folder), generation + 1)
     if generation >= 0:
         assert_same_state(read_parts(folder)[1], state_at(generation))
+        assert_policies(folder, generation)
     assert stored_bytes(folder) == before
     with RunStore.open(folder) as run:
         assert run.notices == []

@@ -18,6 +18,7 @@ from tests.es_service.store_examples import (
     EVALUATION_COLUMNS,
     advance,
     as_table,
+    contents_of,
     create,
     digest,
     evaluated,
@@ -54,11 +55,13 @@ def changed_names(before, after):
 def test_names_are_the_state_parts_and_the_tables(folder):
     parts = digest_parts(folder)
     assert list(parts) == [
+        "state/best",
         "state/centre_0",
         "state/centre_1",
         "state/centre_2",
         "state/guest",
         "state/observations",
+        "map",
         "history",
         "evaluations",
     ]
@@ -84,7 +87,8 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
                 part: arrays and dict(reversed(arrays.items()))
                 for part, arrays in reversed(parts_of(generation).items())
             }
-            store.commit(generation, parts, history_row(generation), evaluated_table(generation))
+            row, centres = history_row(generation), evaluated_table(generation)
+            store.commit(generation, parts, row, centres, contents_of(generation))
     assert digest(tmp_path / "other") == expected
     execute(tmp_path / "other", "VACUUM")
     assert digest(tmp_path / "other") == expected
@@ -92,9 +96,8 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
 
 def test_when_a_part_was_last_written_does_not_count(folder, tmp_path):
     with create(tmp_path / "all", generations=GENERATIONS - 1) as store:
-        store.commit(
-            GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1), evaluated_table(GENERATIONS - 1)
-        )
+        last = GENERATIONS - 1
+        store.commit(last, state_at(last), history_row(last), evaluated_table(last), contents_of(last))
     assert digest(tmp_path / "all") == digest(folder)
 
 
@@ -251,6 +254,6 @@ def test_every_part_of_the_map_counts(tmp_path, part):
         parts = {name: {"x": np.zeros(3, np.float32)} for name in ("map/geometry", "map#000000", "map#000003")}
         parts[part]["x"][1] = changed
         with create(tmp_path / str(changed)) as store:
-            store.commit(0, state_at(0) | parts, history_row(0))
+            store.commit(0, state_at(0) | parts, history_row(0), contents=contents_of(0))
         found.append(digest_parts(tmp_path / str(changed)))
     assert {name for name in found[0] if found[0][name] != found[1][name]} == {"map"}

@@ -31,12 +31,14 @@ from tests.es_service.store_examples import (
     assert_same_evaluations,
     assert_same_history,
     assert_same_state,
+    contents_of,
     create,
     evaluated,
     evaluated_table,
     finished,
     history_row,
     meta,
+    named_at,
     parts_of,
     state_at,
     without_root_rights,
@@ -153,7 +155,9 @@ def test_only_the_next_generation_can_be_committed(tmp_path):
 def test_what_does_not_fit_leaves_the_store_as_it_was(tmp_path):
     with create(tmp_path / "run", generations=3) as run:
         with pytest.raises(StoreError, match="missing columns"):
-            run.commit(3, parts_of(3), {})
+            run.commit(3, parts_of(3), {}, contents=contents_of(3))
+        with pytest.raises(StoreError, match=r"generation 3 names [0-9a-f]{64}, which nobody has"):
+            run.commit(3, parts_of(3), history_row(3))
         with pytest.raises(StoreError, match="dtype"):
             run.commit(3, {"centre_0": {"a": "text"}}, history_row(3))
         assert_same_state(run.load(), state_at(2))
@@ -261,7 +265,9 @@ def test_a_log_that_a_reader_holds_back_is_told_once_and_cut_afterwards(tmp_path
 def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
     history = [history_row(generation) for generation in range(4)]
     platforms = [(0, {"jax": "1"}), (2, {"jax": "2"})]
-    beginning = Beginning(iter(history), state_at(3), {}, platforms, newest=3, evaluations=map(evaluated, range(4)))
+    beginning = Beginning(
+        iter(history), state_at(3), named_at(3), platforms, newest=3, evaluations=map(evaluated, range(4))
+    )
     with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         assert run.generation == 3
         assert run.start is None
@@ -281,7 +287,8 @@ def test_a_fork_s_columns_are_its_own(tmp_path):
     """A newer version may have more columns than the parent's run, or fewer."""
     history = [{**history_row(0), "gone": 1.0}]
     del history[0]["goal_distance"]
-    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), Beginning(history, state_at(0), newest=0)) as run:
+    beginning = Beginning(history, state_at(0), named_at(0), newest=0)
+    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         advance(run, 2)
     first = read_history(tmp_path / "run")[0]
     assert math.isnan(first["goal_distance"])

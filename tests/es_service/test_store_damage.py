@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.protocol.content import name_of, names_in
 from es_service.store import repair
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
@@ -27,9 +28,11 @@ from es_service.store.writer import RunStore
 from tests.database import database, execute
 from tests.es_service.store_examples import (
     advance,
+    assert_policies,
     assert_same_history,
     assert_same_state,
     assert_sound,
+    contents_of,
     copy_at_every_commit,
     create,
     digest,
@@ -38,6 +41,7 @@ from tests.es_service.store_examples import (
     flip_bit,
     history_row,
     parts_of,
+    policy,
     position_of,
     state_at,
     verify_run,
@@ -61,6 +65,70 @@ def test_a_damaged_newest_state_falls_back_one_generation(tmp_path):
         advance(run, 5)
     assert verify_run(folder) == []
     assert digest(folder) == uninterrupted
+
+
+def damage_policy(folder, generation, how):
+    """Damage the policy that a generation has added, or delete it."""
+    ((name, content),) = contents_of(generation).items()
+    if how == "missing":
+        execute(folder, "DELETE FROM content WHERE name = ?", name)
+    else:
+        payload = encode_part(content)
+        flip_bit(folder / "run.db", position_of(folder / "run.db", payload) + len(payload) - 1)
+    return name.hex()
+
+
+@pytest.mark.parametrize("how", ["damaged", "missing"])
+def test_a_damaged_policy_of_the_newest_state_falls_back_one_generation(tmp_path, how):
+    folder = finished(tmp_path / "run", 6)
+    uninterrupted = digest(folder)
+    name = damage_policy(folder, 5, how)
+    assert "state of 'map' at generation 5 names a content that is missing or damaged" in verify_run(folder)
+    with pytest.raises(StoreError, match=f"{name}.*(does not match its name|, which its state names)"):
+        read_parts(folder, named=lambda generation, parts: names_in(parts["map"]))
+    with RunStore.open(folder) as run:
+        (notice,) = run.notices
+        assert "of the newest generation, 5, is damaged" in notice
+        assert "names a content that is missing or damaged" in notice
+        assert "fell back to generation 4" in notice
+        assert_same_state(run.load(), state_at(4))
+        assert_policies(folder, 4)
+        advance(run, 5)
+    assert_sound(folder, 5)
+    assert digest(folder) == uninterrupted
+
+
+def test_a_damaged_policy_that_two_states_name_takes_both(tmp_path):
+    """That of generation 6 is still in a cell of generations 7 and 8; the next state that is kept is that of 4."""
+    folder = kept_run(tmp_path / "run", 8)
+    uninterrupted = digest(folder)
+    damage_policy(folder, 6, "damaged")
+    with RunStore.open(folder) as run:
+        assert "generations 5 to 8 are not complete and intact" in run.notices[0]
+        run.keep_every = 4
+        assert_policies(folder, 4)
+        advance(run, 8)
+    assert_sound(folder, 8)
+    assert digest(folder) == uninterrupted
+
+
+def test_a_damaged_policy_of_an_older_state_costs_nothing(tmp_path):
+    folder = kept_run(tmp_path / "run", 11)
+    damage_policy(folder, 6, "damaged")
+    with RunStore.open(folder) as run:
+        assert "newest generation, 11, is intact" in run.notices[0]
+    assert_sound(folder, 11)
+    assert read_kept(folder)[1] == [0, 4, 10, 11]
+
+
+def test_a_policy_that_nothing_names_is_deleted_and_said(tmp_path):
+    folder = finished(tmp_path / "run", 6)
+    content = policy(99)
+    execute(folder, "INSERT INTO content VALUES (?, ?)", name_of(content), encode_part(content))
+    with RunStore.open(folder) as run:
+        assert f"the content {name_of(content).hex()} is named by nothing" in run.notices[0]
+        assert run.generation == 5
+    assert_sound(folder, 5)
 
 
 def test_a_damaged_newest_history_row_falls_back_one_generation(tmp_path):

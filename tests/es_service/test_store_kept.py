@@ -10,7 +10,16 @@ from es_service.errors import StoreError
 from es_service.store.reader import read_kept, read_parts
 from es_service.store.writer import RunStore
 from tests.database import execute
-from tests.es_service.store_examples import advance, assert_same_state, assert_sound, create, digest, finished, state_at
+from tests.es_service.store_examples import (
+    advance,
+    assert_policies,
+    assert_same_state,
+    assert_sound,
+    create,
+    digest,
+    finished,
+    state_at,
+)
 
 
 def kept(folder):
@@ -18,6 +27,7 @@ def kept(folder):
     whole = read_kept(folder)[1]
     for generation in whole:
         assert_same_state(read_parts(folder, generation)[1], state_at(generation))
+        assert_policies(folder, generation)
     return whole
 
 

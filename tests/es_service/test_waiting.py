@@ -5,12 +5,10 @@ import shutil
 import signal
 import sqlite3
 
-import numpy as np
 import pytest
 
 from es_service import api
 from es_service.errors import DatabaseHeldError, EvaluationError, Interrupted
-from es_service.protocol.content import name_of, names
 from es_service.runs import waiting
 from es_service.runs.certification import certify_run
 from es_service.runs.run_status import read_status, state
@@ -21,11 +19,15 @@ from es_service.store import writer
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
+    advance,
+    assert_same_state,
+    contents_of,
     create,
     digest,
     evaluated_table,
     history_row,
     parts_of,
+    policy,
 )
 
 CONFIG = {
@@ -160,18 +162,7 @@ def held(folder, tell=lambda notice: None, should_stop=lambda: None, generations
 def give(patient, first, last):
     for generation in range(first, last + 1):
         row = history_row(generation)
-        patient.commit(generation, with_policy(generation)[0], row, evaluated_table(generation), policy(generation))
-
-
-def policy(generation):
-    """The policy that a generation brings, by its name."""
-    content = {"parameters_D": np.full(3, generation // 2, np.float32)}
-    return {name_of(content): content}
-
-
-def with_policy(generation):
-    """What a generation changes, with the name of its policy."""
-    return {**parts_of(generation), "named": {"policy": names(policy(generation))}}, policy(generation)
+        patient.commit(generation, parts_of(generation), row, evaluated_table(generation), contents_of(generation))
 
 
 def test_the_loop_reads_policies_whether_they_wait_or_not(tmp_path):
@@ -179,20 +170,17 @@ def test_the_loop_reads_policies_whether_they_wait_or_not(tmp_path):
         for last in range(3, 9):
             give(patient, last, last)
             for generation in range(3, last + 1):
-                [(name, content)] = policy(generation).items()
-                np.testing.assert_array_equal(patient.content(name)["parameters_D"], content["parameters_D"])
+                assert_same_state({"": patient.content(*contents_of(generation))}, {"": policy(generation)})
         assert store.generation == 2
         viewer.leave()
         give(patient, 9, 9)
         assert store.generation == 9
-        assert patient.content(*policy(9))["parameters_D"][0] == 4
-        assert set(store.contents()) == {*policy(8), *policy(9)}
+        assert_same_state({"": patient.content(*contents_of(9))}, {"": policy(9)})
+        assert set(store.contents()) == {name for at in range(6, 10) for name in contents_of(at)}
         with pytest.raises(KeyError):
-            patient.content(*policy(3))
+            patient.content(*contents_of(5))
     with create(tmp_path / "whole", generations=3) as whole:
-        for generation in range(3, 10):
-            parts, contents = with_policy(generation)
-            whole.commit(generation, parts, history_row(generation), evaluated_table(generation), contents)
+        advance(whole, 9)
     assert digest(tmp_path / "run") == digest(tmp_path / "whole")
 
 
