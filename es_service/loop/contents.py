@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,7 @@ class Contents:
         """Take in those of a new generation, and how they were made. Those of the one before are stored."""
         self._newest = contents
         self._origins |= origins
-        for name in [*self._origins][: max(0, len(self._origins) - MOST_ORIGINS)]:
+        for name in [*islice(self._origins, max(0, len(self._origins) - MOST_ORIGINS))]:
             del self._origins[name]
 
     def of(self, wanted: Sequence[bytes]) -> dict[bytes, Arrays]:

@@ -164,7 +164,7 @@ class WorkerSpec:
     """Whether environments of Gymnasium draw the starts of policies' episodes with the noise of the reset keys, so that
     they are those of a task in JAX; no run does so."""
     parent_cache_bytes: int = 2**28
-    """Most bytes of parents that the worker keeps; see `sent.py`."""
+    """Most bytes of arrays that the worker remembers, beyond what one work item needs; see `sent.Memory`."""
     recycle_after_episodes: int | None = None
     """Episodes after which each core of a worker should be a new process; None: any number."""
     memory_bytes: int | None = None
