@@ -109,6 +109,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
         for table in GENERATION_TABLES:
             connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
         connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
+        connection.execute("REINDEX content")
         collect_contents(connection)
         certifications.remove(connection, verdict.bad_certifications)
     if verdict.good == verdict.newest:

@@ -224,6 +224,23 @@ def test_a_state_row_that_vanished_is_not_replaced_by_an_older_one(tmp_path):
         assert "fell back" in run.notices[0]
 
 
+def test_a_damaged_index_of_the_contents_is_noticed_and_made_again(tmp_path):
+    folder = finished(tmp_path / "run", 6)
+    uninterrupted, name = digest(folder), next(iter(contents_of(5)))
+    content = (folder / "run.db").read_bytes()
+    places = [at for at in range(len(content)) if content.startswith(name, at)]
+    for place in places:
+        (folder / "run.db").write_bytes(content)
+        flip_bit(folder / "run.db", place + 20)
+        assert verify_run(folder)
+        with RunStore.open(folder) as run:
+            assert len(run.notices) == 1
+            advance(run, 5)
+        assert_sound(folder, 5)
+        assert digest(folder) == uninterrupted
+    assert len(places) > 2, "the policy, its index, and the blocks that name it"
+
+
 def kept_run(folder, last, every=4):
     """A run that keeps states, and ended cleanly."""
     with create(folder) as run:
