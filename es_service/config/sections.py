@@ -340,9 +340,9 @@ class ComputeConfig(Section):
     )
     parent_cache_mb: Count = Field(
         256,
-        description="Most MiB of parameters that each worker remembers, so that they are sent to it once: of elites from "
-        "which it makes policies, and of centres. What its newest work item needs is remembered in any case. It never "
-        "changes results.",
+        description="Most MiB of parameters that each worker remembers, so that they are sent to it once: of elites "
+        "from which it makes policies, and of centres. What its newest work item needs is remembered in any case. It "
+        "never changes results.",
     )
     worker_memory_mb: Count | None = Field(
         None,
