@@ -91,9 +91,11 @@ def states(task: str, count: int, seed: int = 0) -> Given:
     return Given(*(np.array(column, np.float32) for column in zip(*rows, strict=True)))
 
 
-def steps_in_c(task: str, given: Given) -> tuple[Steps, np.ndarray]:
+def steps_in_c(task: str, given: Given, physics: str = "mujoco") -> tuple[Steps, np.ndarray]:
     """(control steps in C MuJoCo, [N] numbers of contacts with walls after them)."""
     environment, rows = ENVIRONMENTS[task](), []
+    if physics == "mujoco_euler":
+        environment.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     walls = {environment.model.geom(f"wall_{number}").id for number in range(len(boxes(task)))}
     for qpos, qvel, action in zip(*given, strict=True):
         environment.set_state(qpos.astype(float), qvel.astype(float))
@@ -105,9 +107,9 @@ def steps_in_c(task: str, given: Given) -> tuple[Steps, np.ndarray]:
 
 
 @cache
-def kernel_of(task: str) -> Callable[..., Any]:
+def kernel_of(task: str, physics: str = "mujoco") -> Callable[..., Any]:
     """Control step by simd: states and actions -> (states, observations, rewards, ends)."""
-    environment = make_environment(task, {"physics": "mujoco"})
+    environment = make_environment(task, {"physics": physics})
 
     def step(state: Any, action: Any) -> tuple[Any, ...]:
         after, reward, done = environment.step(state, action)
@@ -150,6 +152,6 @@ def put(state: Any, qpos: np.ndarray, qvel: np.ndarray) -> Any:
     return state._replace(physics=state.physics._replace(qpos=qpos, qvel=qvel))
 
 
-def steps_by_simd(task: str, given: Given) -> Steps:
+def steps_by_simd(task: str, given: Given, physics: str = "mujoco") -> Steps:
     state = put(resets(task, len(given.qpos)), given.qpos, given.qvel)
-    return Steps(*kernel_of(task)(state, given.action)[1:])
+    return Steps(*kernel_of(task, physics)(state, given.action)[1:])

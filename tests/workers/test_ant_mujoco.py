@@ -110,22 +110,24 @@ def test_contacts_with_walls_are_those_of_c_mujoco(task: str):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("physics", ["mujoco", "mujoco_euler"])
 @pytest.mark.parametrize("task", TASKS)
-def test_a_control_step_is_that_of_c_mujoco(task: str):
+def test_a_control_step_is_that_of_c_mujoco(task: str, physics: str):
     """Of 1,000 states: 99 % of errors are at most TIMES, and all at most GREATEST times as great as the greatest that
     one ulp makes in C MuJoCo, with its unit 1e-6. The reward of AntTrap is a difference of two places, and the second
     is rounded to float32, too."""
     given, rng = ants.states(task, 1000), np.random.default_rng(1)
-    (truth, touches), found, moved = ants.steps_in_c(task, given), ants.steps_by_simd(task, given), []
+    truth, touches = ants.steps_in_c(task, given, physics)
+    found, moved = ants.steps_by_simd(task, given, physics), []
     for _ in range(4):
         qpos, qvel = (
             np.nextafter(x, np.where(rng.random(x.shape) < 0.5, -9e9, 9e9).astype(x.dtype)) for x in given[:2]
         )
-        moved.append(ants.steps_in_c(task, ants.Given(qpos, qvel, given.action))[0])
+        moved.append(ants.steps_in_c(task, ants.Given(qpos, qvel, given.action), physics)[0])
     if task == "ant_trap":
         ulp = np.spacing(np.abs(given.qpos[:, 0])) / STEP_S
         moved.append(truth._replace(reward=truth.reward + ulp))
-    print(f"\n{task}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more")
+    print(f"\n{task}, {physics}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more")
     assert (touches > 0).mean() > 0.1
     for what in ("observation", "reward"):
         right = getattr(truth, what).reshape(len(touches), -1)

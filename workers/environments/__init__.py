@@ -22,8 +22,8 @@ if TYPE_CHECKING:  # it imports this module
     from workers.environments.host_task import HostTask
 
 
-PHYSICS = ("spring", "mujoco")
-"""Physics of the ants: Brax's springs, or MuJoCo by MJX."""
+PHYSICS = ("spring", "mujoco", "mujoco_euler")
+"""Physics of the ants: Brax's springs, or MuJoCo by MJX with the integrator RK4 of `ant.xml`, or with Euler."""
 
 SHIPPED: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(

@@ -24,7 +24,7 @@ def make(physics: str = "spring") -> Environment:
     """Functions of AntMaze.
 
     Args:
-        physics: `spring` or `mujoco`; see `ant_in`.
+        physics: see `ant_in`.
     """
     ant = ant_in(physics, WALLS)
 

@@ -1,4 +1,4 @@
-"""The ant of AntMaze and AntTrap in MuJoCo's physics, by MJX: `task.options.physics: mujoco`.
+"""The ant of AntMaze and AntTrap in MuJoCo's physics, by MJX: `task.options.physics: mujoco` or `mujoco_euler`.
 
 The model is that of `ant_model.py`, which C MuJoCo steps in `gymnasium:es_service/AntMazeMujoco-v0` and
 `AntTrapMujoco-v0`. An episode begins as with Brax's springs, with the same positions and velocities of the joints.
@@ -14,7 +14,7 @@ from es_service.protocol.messages import Segment
 from workers.environments.ant import Ant, joint_noise
 from workers.environments.ant_model import SUBSTEPS, ant_model, boxes_of, compiled, first_qpos
 from workers.environments.ant_tasks import FORCE_LIMIT, JOINTS, STEP_S
-from workers.environments.mujoco_parts import MujocoState, mjx, mujoco_viewer, put_model, start, step_and_look
+from workers.environments.mujoco_parts import MujocoState, mjx, mujoco, mujoco_viewer, put_model, start, step_and_look
 from workers.environments.wall_boxes import SLOTS, wall_contacts
 
 
@@ -37,14 +37,18 @@ class MujocoAntState(NamedTuple):
         return self.physics.qvel
 
 
-def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
+def make_ant(walls: tuple[Segment, ...] = (), integrator: str = "RK4") -> Ant:
     """Build the ant of a task.
+
+    Args:
+        integrator: that of the model, `RK4`, or `Euler`.
 
     Raises:
         TaskError: the package gymnasium, which has the ant's model, is not installed.
     """
     box_W_4 = boxes_of(walls)
     model = compiled(box_W_4[:SLOTS])
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     mx, contacts, init_q = put_model(model), wall_contacts(box_W_4) if walls else {}, first_qpos(model)
 
     def reset(key: Any, at: tuple[float, float]) -> MujocoAntState:

@@ -31,7 +31,7 @@ def make(physics: str = "spring", contact_forces: str = "computed") -> Environme
     """Functions of AntTrap.
 
     Args:
-        physics: `spring` or `mujoco`; see `ant_in`.
+        physics: see `ant_in`.
         contact_forces: `computed`, as in Gym's ant and in the benchmark; or `zero` in observations and in the reward,
             as with mujoco-py and MuJoCo 2, which did not compute them.
     """
