@@ -2,6 +2,7 @@
 
     python -m tests.benchmarks.certified                                   # all that is missing: hours on two cores
     python -m tests.benchmarks.certified --task ant_trap --method nsr_es me_es --seeds 0:2
+    python -m tests.benchmarks.certified --physics mujoco                  # AntMaze and AntTrap by MuJoCo's equations
     python -m tests.benchmarks.certified --table                           # only print the tables
     python -m tests.benchmarks.certified --config my.yaml --seeds 100:101 --marks 30_000_000 --set search.sigma=0.05
 
@@ -10,6 +11,9 @@ of environment steps, its best centre and ten fittest elites are certified, and 
 time as cores, each in one process; each gives a row for each mark in results/certified_methods.csv, and is not computed
 again. One that is interrupted goes on from its folder in runs/certified_methods. The last form is a trial, whose rows
 are printed and added to results/certified_trials.csv.
+
+With `--physics mujoco`, the ants are trained with `physics: mujoco_euler` and certified in C MuJoCo, too, with Gym's
+model and its integrator RK4: the columns `elsewhere_*` of results/certified_mujoco.csv.
 """
 
 from __future__ import annotations
@@ -32,13 +36,18 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 RUNS = ROOT / "runs" / "certified_methods"
 RESULTS = Path(__file__).parent / "results" / "certified_methods.csv"
-TRIALS = RESULTS.with_name("certified_trials.csv")
+TRIALS, MUJOCO = (RESULTS.with_name(f"certified_{name}.csv") for name in ("trials", "mujoco"))
 TASKS = ("point_maze", "ant_maze", "ant_trap")
 SHIPPED = ("memes", "map_elites")
 METHODS = ("es", "ns_es", "nsr_es", "nsra_es", "me_es", *SHIPPED, "ars")
 MARKS = (1_000_000, 10_000_000, 100_000_000)
 RUN = ["task", "method", "settings", "seed"]
 SEEDS = 5
+EULER = "task.options.physics=mujoco_euler"
+IN_C = {"ant_maze": "gymnasium:es_service/AntMazeMujoco-v0", "ant_trap": "gymnasium:es_service/AntTrapMujoco-v0"}
+"""Task -> the same one in C MuJoCo."""
+MUJOCO_SEEDS = {"memes": 5, "nsra_es": 5, "me_es": 3, "map_elites": 3, "ars": 3}
+"""Method -> number of its seeds in MuJoCo, which begin with 0."""
 
 
 class Shown(NamedTuple):
@@ -74,6 +83,7 @@ class Wanted(NamedTuple):
 def run_one(wanted: Wanted) -> pd.DataFrame:
     """One run from its config, or from where it was interrupted: a row for each mark."""
     code, folder = commit(), RUNS / wanted.name
+    in_c = IN_C.get(api.load_config(wanted.config).task.environment) if EULER in wanted.settings else None
     with workers_in_this_process():
         for number, mark in enumerate(wanted.marks):
             limits = ("env_steps", mark), ("generations", "null"), ("target_certified", "null")
@@ -81,7 +91,7 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
             fixed = ("compute.engine=inline", "compute.workers=1", f"seed={wanted.seed}")
             api.run_or_resume(api.load_config(wanted.config, (*fixed, *budget, *wanted.settings)), folder)
             if number > max((policy.number for policy in certified_policies(folder)), default=-1):
-                certify_run(folder, workers=1)
+                certify_run(folder, workers=1, task=in_c)
     run = api.open_run(folder)
     rows = []
     for policy in certified_policies(folder):
@@ -129,13 +139,17 @@ def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
     ]
 
 
-def in_words(table: pd.DataFrame) -> str:
-    """The results in Markdown: the median over the seeds at each mark, with the range."""
+def in_words(table: pd.DataFrame, columns: str = "") -> str:
+    """The results in Markdown: the median over the seeds at each mark, with the range.
+
+    Args:
+        columns: what the names of the columns begin with.
+    """
     head = ["method", *(f"{shown.title}, {mark:.0e}".replace("e+0", "e") for shown in SHOWN for mark in shown.marks)]
     lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     for method in METHODS:
         cells = [
-            _cell(table[(table.task == shown.task) & (table.method == method)], shown.column, mark)
+            _cell(table[(table.task == shown.task) & (table.method == method)], columns + shown.column, mark)
             for shown in SHOWN
             for mark in shown.marks
         ]
@@ -164,24 +178,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--seeds", metavar="A:B", default=f"0:{SEEDS}")
+    parser.add_argument("--seeds", metavar="A:B", help="default: 0:5, or those that the table in MuJoCo has")
+    parser.add_argument("--physics", choices=("spring", "mujoco"), default="spring")
     parser.add_argument("--marks", nargs="+", type=lambda text: int(float(text.replace("_", ""))), default=MARKS)
     parser.add_argument("--table", action="store_true", help="run nothing")
     parser.add_argument("--config", type=Path, help="a trial: a config of your own")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of a trial")
     given = parser.parse_args()
-    path, trial = (TRIALS, True) if given.config else (RESULTS, False)
+    in_mujoco, trial = given.physics == "mujoco", given.config is not None
+    path = TRIALS if trial else MUJOCO if in_mujoco else RESULTS
     if given.set and not trial:
         parser.error("--set needs --config")
-    configs = [given.config] if trial else [config_of(task, method) for task in given.task for method in given.method]
+    settings = (*([EULER] if in_mujoco else []), *given.set)
+    tasks = [task for task in given.task if task in IN_C or not in_mujoco]
+    methods = [method for method in given.method if method in MUJOCO_SEEDS or not in_mujoco]
+    count = dict.fromkeys(METHODS, SEEDS) | (MUJOCO_SEEDS if in_mujoco else {})
+    chosen = [(given.config, SEEDS)] if trial else [(config_of(a, b), count[b]) for a in tasks for b in methods]
     wanted = [
-        Wanted(config, seed, tuple(given.marks), tuple(given.set))
-        for seed in seeds_of(given.seeds)
-        for config in configs
+        Wanted(config, seed, tuple(given.marks), settings)
+        for seed in seeds_of(given.seeds or f"0:{SEEDS}")
+        for config, most in chosen
+        if given.seeds or seed < most
     ]
     if not given.table:
         compute(missing(wanted, read(path)), run_one, lambda rows: keep(path, rows), RUNS)
-    print(in_words(read(path)))
+    print(in_words(read(path), "elsewhere_" if in_mujoco else ""))
 
 
 if __name__ == "__main__":
