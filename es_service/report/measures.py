@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 CERTIFIED = "certified"
 SUCCESS = "certified_success"
 GAP = "selection_gap"
-ELSEWHERE = "certified in "
-"""Beginning of the column of a value that was certified in another task."""
+ELSEWHERE, GAP_ELSEWHERE = "certified in ", "gap in "
+"""Beginnings of the columns of what was certified in another task: the value, and how much higher it is there."""
 
 
 class Measure(NamedTuple):
@@ -79,9 +79,12 @@ MEASURES = {
 
 def measure_named(column: str) -> Measure:
     """What is said of a column of the history."""
-    if column.startswith(ELSEWHERE):
-        note = "Mean fitness of the policy in this other task, in episodes that no selection has seen."
-        return Measure(column[:1].upper() + column[1:], column, note)
+    for beginning, note in (
+        (ELSEWHERE, "Mean fitness of the policy in this other task, in episodes that no selection has seen."),
+        (GAP_ELSEWHERE, "How much higher the certified value is in this other task than in the task of the run."),
+    ):
+        if column.startswith(beginning):
+            return Measure(column[:1].upper() + column[1:], column, note)
     if column.startswith(METRIC):
         name = column.removeprefix(METRIC)
         return Measure(name, name, "Metric of the search.")
@@ -90,7 +93,8 @@ def measure_named(column: str) -> Measure:
 
 def measures(runs: Sequence[RunData]) -> dict[str, Measure]:
     """Column -> what is said of it, for all columns that all runs have a value of."""
-    elsewhere, own = ([column for column in runs[0].history if column.startswith(one)] for one in (ELSEWHERE, METRIC))
+    of_both = (ELSEWHERE, GAP_ELSEWHERE), METRIC
+    elsewhere, own = ([column for column in runs[0].history if column.startswith(one)] for one in of_both)
     names = [CERTIFIED, SUCCESS, *elsewhere, *(name for name in MEASURES if name not in (CERTIFIED, SUCCESS)), *own]
     return {name: measure_named(name) for name in names if all(has_values(run, name) for run in runs)}
 
@@ -112,8 +116,8 @@ def chosen(runs: Sequence[RunData], names: Sequence[str]) -> dict[str, Measure]:
 
 def has_curve(runs: Sequence[RunData], column: str) -> bool:
     """Whether a measure of runs is drawn as a curve: certified values only if they were certified before their ends."""
-    if column == GAP or column.startswith(CERTIFIED):
-        return column != GAP and all(np.isfinite(run.history[column][:-1]).any() for run in runs)
+    if column == GAP or column.startswith((CERTIFIED, GAP_ELSEWHERE)):
+        return column.startswith(CERTIFIED) and all(np.isfinite(run.history[column][:-1]).any() for run in runs)
     return True
 
 
@@ -141,6 +145,7 @@ def with_derived(history: Columns, certified: Sequence[Mapping[str, Any]], fitne
             found[SUCCESS] = row["successes"] / row["episodes"]
         if "elsewhere" in row:
             found[f"{ELSEWHERE}{row['elsewhere']}"] = row[f"elsewhere_{value}"]
+            found[f"{GAP_ELSEWHERE}{row['elsewhere']}"] = row[f"gap_{value}"]
         for name, number in found.items():
             column_G = derived.setdefault(name, np.full(steps_G.size, np.nan))
             column_G[steps_G >= since] = number

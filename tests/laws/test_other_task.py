@@ -247,6 +247,20 @@ def test_every_reader_shows_the_other_tasks(copied, tmp_path):
     np.testing.assert_array_equal(copied.policy("certified").parameters_D, newest.parameters_D)
 
 
+def test_a_comparison_shows_the_values_there_and_the_gaps(copied, tmp_path):
+    other = api.run(api.load_config(CONFIG, ["seed=5"]), tmp_path / "of_seed_5", progress=False).run
+    rows = [certify_run(run.folder, top=0, episodes=16, **CORNER)[0].row() for run in (copied, other)]
+    [page] = es_service.write_comparison([copied.folder, other.folder], tmp_path / "both.html")
+    table = page.read_text().partition('id="final"')[2].partition("</table>")[0]
+    _, *heads = re.findall(r'<th scope="col">(.*?)</th>', table)
+    shown = dict(zip(heads, re.findall(r"<td>(.*?)</td>", table), strict=True))
+    for name, column in (("certified in", "elsewhere_return_mean"), ("gap in", "gap_return_mean")):
+        values = [row[column] for row in rows]
+        cell = shown[f"{name} point_maze (start = corner)"]
+        assert number(float(np.median(values))) in cell
+        assert f"{number(min(values))} to {number(max(values))}" in cell
+
+
 def test_a_run_goes_on_with_them_and_a_fork_has_none_but_new_episodes(copied, tmp_path):
     certify_run(copied.folder, top=0, episodes=16, **CORNER)
     more = api.resume(copied.folder, ["budget.generations=5"], progress=False).run
