@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
 import sys
 import textwrap
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,6 +25,7 @@ from workers.environments import describe_environment, make_environment
 from workers.environments.mujoco_parts import mujoco
 from workers.step_cost import LANES, step_cost
 
+ROOT = Path(__file__).parents[2]
 ARM = "tests.examples.reaching_arm:ReachingArm"
 XML = """<mujoco><option timestep="0.01"/><worldbody><body><joint type="slide" axis="1 0 0"/><geom size="0.1"/>
 <site name="tip" pos="0.5 0 0"/></body></worldbody>
@@ -249,6 +254,35 @@ def test_what_a_control_step_costs_and_how_far_it_is_from_c_mujoco():
     findings = step_findings(describe_environment(f"{__name__}:Slider"), asdict(cost))
     levels = {sentence.partition(" ")[0]: level for level, sentence in findings}
     assert levels == {"a": "ok", "with": "note", "after": "ok"}
+
+
+def blocks_of_the_guide() -> list[str]:
+    """The class and the script in the guide's section about models of one's own."""
+    guide = (ROOT / "workers" / "own_tasks.md").read_text()
+    section = guide.partition("\n## A model of your own\n")[2].partition("\n## ")[0]
+    return re.findall(r"^```text\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
+
+
+def test_the_guide_shows_what_is_in_the_example():
+    """Its class is the example's, but for comments and what it leaves out; its script's config has known keys."""
+    shown, script = blocks_of_the_guide()
+    example = ROOT / "tests" / "examples" / "reaching_arm.py"
+    lines_of = [[line.partition("  #")[0] for line in text.splitlines()] for text in (example.read_text(), shown)]
+    assert len(shown.splitlines()) > 8
+    assert [line for line in lines_of[1] if line not in lines_of[0]] == []
+    names: dict[str, Any] = {}
+    exec(script.partition("print(")[0], names)
+    assert names["config"]["task"].pop("environment") == ARM
+    api.load_config(names["config"] | {"task": {"environment": "point_maze"} | names["config"]["task"]})
+
+
+@pytest.mark.long
+def test_the_script_of_the_guide_prints_a_map(tmp_path):
+    """It takes half a minute, most of which is the description of the task and the code of its episodes."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    words = [sys.executable, "-c", blocks_of_the_guide()[1]]
+    run = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=500, check=True)
+    assert len([line for line in run.stdout.splitlines() if line[:1].isdigit()]) == 5, "the five fittest elites"
 
 
 @pytest.mark.slow
