@@ -198,22 +198,12 @@ def test_the_generation_at_the_top_of_the_guide_is_the_service_s(tmp_path):
     assert compared == 4
 
 
-MOST = {
-    # lines, sentences of more than 35 words, cells of tables of more than 160 characters
+MOST = dict.fromkeys(LOOKED_AT, (400, 0, 0)) | {
     "README.md": (150, 0, 0),
-    USING: (400, 0, 0),
-    "es_service/guides/certify.md": (400, 0, 0),
-    "es_service/README.md": (400, 0, 0),
-    "configs/README.md": (400, 0, 0),
-    "configs/which_method.md": (400, 0, 0),
-    "configs/methods.md": (400, 0, 0),
-    "configs/parts.md": (400, 0, 0),
-    "configs/keys.md": (400, 0, 0),
-    "configs/sweeps.md": (400, 3, 0),
-    "configs/own_searches.md": (400, 11, 1),
-    "configs/other_libraries.md": (400, 1, 0),
+    "tests/benchmarks/README.md": (695, 44, 4),
+    "CHANGELOG.md": (201, 6, 0),
 }
-"""Guide -> the most of each; a guide that is rewritten joins, or gets lower numbers."""
+"""Guide -> the most lines, sentences of more than 35 words, and cells of more than 160 characters. They only fall."""
 
 
 def long_sentences(text: str) -> list[str]:
@@ -221,7 +211,7 @@ def long_sentences(text: str) -> list[str]:
     prose = re.sub(r"^```.*?^```|^[|#!<][^\n]*$", "", text, flags=re.MULTILINE | re.DOTALL)
     prose = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", prose)
     prose = re.sub(r"`[^`]*`", "code", re.sub(r"(?<=[.!?]\s)`[^`]*`", "Code", prose))
-    sentences = re.split(r"(?<=[.!?:;])\s+(?=[A-Z(*])|\n\n|\n- |\n\d+\. ", prose)
+    sentences = re.split(r"(?<=[.!?:;])\s+(?=[A-Z(*])|\n\n|\n *(?:-|\d+\.) ", prose)
     return [" ".join(sentence.split()) for sentence in sentences if len(sentence.split()) > 35]
 
 
