@@ -176,8 +176,8 @@ def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: Worker
                         answer = ("lacks", item, attempt)
                     except BaseException as error:  # also sys.exit in an environment
                         answer = ("failure", item, attempt, raised(error, *spec.task_code))
+                    said.report()  # first, since nobody may listen after the last answer
                     said.say(*answer)
-                    said.report()
 
 
 class _Said:

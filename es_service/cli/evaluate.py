@@ -19,13 +19,14 @@ from es_service.cli.options import (
     JsonOption,
     LogLevelOption,
     RunsArgument,
+    ShowOutputOption,
     is_single,
     items_of_each,
     of_each,
     place_of,
     readable,
 )
-from es_service.cli.printing import console, errors, print_json, print_line, print_note
+from es_service.cli.printing import console, errors, output_shown, print_json, print_line, print_note
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.system import given_path
 from es_service.report.progress import print_notice
@@ -88,6 +89,7 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", parser=given_path, help="Also write the rows to this CSV file.")
     ] = None,
+    show_output: ShowOutputOption = False,
     as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
@@ -114,7 +116,7 @@ def evaluate(
     single = is_single(folders)
     begun = of_each(folders, lambda run: run)
     width = None if single else max((len(str(run)) for run, result in begun if result is not None), default=0)
-    tell = partial(print_notice, errors)
+    told = {"on_notice": partial(print_notice, errors), "on_output": output_shown(show_output)}
 
     def fresh_rows(folder: Path) -> Iterator[dict[str, Any]]:
         run = api.open_run(folder)
@@ -125,7 +127,7 @@ def evaluate(
         if single and not as_json:
             print_header(console)
         results = []
-        for fresh in evaluation.evaluate(run, chosen, episodes or 100, workers, seed or 0, on_compile=tell):
+        for fresh in evaluation.evaluate(run, chosen, episodes or 100, workers, seed or 0, **told):
             results.append(fresh)
             row = row_of(fresh, run.descriptor_names, None if single else folder)
             if not as_json:
@@ -139,7 +141,7 @@ def evaluate(
         given: dict[str, Any] = {"episodes": episodes, "keep": keep, "by": by, "task": task, "overrides": set_}
         certified = certify_run(
             folder, best=best or not anything, centre=centre, cells=cells, top=0 if anything and top is None else top,
-            generation=generation, workers=workers, on_notice=tell,
+            generation=generation, workers=workers, **told,
             **{name: value for name, value in given.items() if value is not None},
         )  # fmt: skip
         if not as_json:

@@ -96,6 +96,8 @@ def run(
     """Start a run from a config file; with --seeds, a run for each seed."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
     if seeds is not None:
+        if show_output:
+            raise ConfigError("--show-output and --seeds cannot be combined; `status` shows the newest lines of a run")
         run_seeds(config, seeds, out, wanted, seed, log, log_level, as_json=as_json)
         return
     if or_resume and out is None:

@@ -110,6 +110,11 @@ def print_note(message: str, style: str | None = None) -> None:
         print_line(errors, message, style)
 
 
+def output_shown(wanted: bool) -> Callable[[str], None]:
+    """What `--show-output` does with the lines that workers print."""
+    return print_note if wanted else lambda line: None
+
+
 def print_finding(level: str, text: str) -> None:
     """Print a finding of `doctor`, whose level is "ok", "note" or "FAIL", on stdout."""
     colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]

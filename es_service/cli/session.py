@@ -20,10 +20,11 @@ from es_service.cli.options import (
     RunArgument,
     SeedOption,
     SetOption,
+    ShowOutputOption,
     WorkersOption,
     overrides,
 )
-from es_service.cli.printing import command, console, errors, print_json_line, print_line, print_note
+from es_service.cli.printing import command, console, errors, output_shown, print_json_line, print_line, print_note
 from es_service.cli.status import print_certified, print_summary
 from es_service.errors import Interrupted, ServiceError, WayOut
 from es_service.loop.history import Row
@@ -79,7 +80,7 @@ def session(
                 on_generation=partial(tell_generation, show),
                 on_notice=partial(tell, note),
                 on_compile=partial(tell, note),
-                on_output=partial(tell, print_note) if show_output else lambda line: None,
+                on_output=output_shown(show_output),
             )
     except Interrupted:
         if began or holds_run(folder):
@@ -119,6 +120,7 @@ def polish(
     address: AddressOption = None,
     log: LogOption = None,
     log_level: LogLevelOption = None,
+    show_output: ShowOutputOption = False,
 ) -> None:
     """Start a new run that improves policies of another one, and certify both; search.objective says what improves."""
     from es_service.runs.polishing import certified_for, polish_config
@@ -127,10 +129,10 @@ def polish(
     wanted = overrides([*chosen, *(set_ or ())], seed=seed, workers=workers, engine=engine, address=address)
     config = polish_config(parent, wanted)
     folder = out if out is not None else api.default_folder(config)
-    tell = partial(print_notice, errors)
-    before = certified_for(api.open_run(parent), config, tell, workers=workers)  # first: a driver may hold the parent
-    session(folder, partial(api.run, config, folder), log)
-    after = certified_for(api.open_run(folder), config, tell, workers=workers, centre=True)
+    told = partial(print_notice, errors), output_shown(show_output)
+    before = certified_for(api.open_run(parent), config, *told, workers=workers)  # first: a driver may hold the parent
+    session(folder, partial(api.run, config, folder), log, show_output=show_output)
+    after = certified_for(api.open_run(folder), config, *told, workers=workers, centre=True)
     for what, certified in (("before", before), ("after", after)):
         print_line(console, f"certified {what} polishing:")
         print_certified(console, certified)

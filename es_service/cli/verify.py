@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from es_service import api
-from es_service.cli.options import JsonOption, LogLevelOption, RunArgument
-from es_service.cli.printing import console, print_error, print_json, print_line, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, ShowOutputOption
+from es_service.cli.printing import console, output_shown, print_error, print_json, print_line, print_note
 from es_service.errors import RunLockedError
 from es_service.runs.checked_config import changed_config
 from es_service.runs.verification import (
@@ -27,14 +27,15 @@ def verify(
         int, typer.Option("--generations", min=1, help="Generations to compute from each state that is kept.")
     ] = 1,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
+    show_output: ShowOutputOption = False,
     as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
     """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs, 3 if
     this cannot be judged: the run is running, or a task cannot be run here or does not repeat itself."""
-    run = api.open_run(folder)
+    run, on_output = api.open_run(folder), output_shown(show_output)
     try:
-        recomputed = recompute(run, generations, workers)
+        recomputed = recompute(run, generations, workers, on_output)
     except RunLockedError as error:
         print_error(error)
         raise typer.Exit(3) from None
@@ -45,7 +46,7 @@ def verify(
         if not as_json:
             print_line(console, _line(group))
     certified: list[RecomputedCertification] = []
-    for one in recomputed_certifications(run, workers):
+    for one in recomputed_certifications(run, workers, on_output):
         certified.append(one)
         if not as_json:
             print_line(console, _certified_line(one))

@@ -79,6 +79,7 @@ def certify_run(
     overrides: Overrides = (),
     workers: int | None = None,
     on_notice: Callable[[str], None] = warn,
+    on_output: Callable[[str], None] = lambda line: None,
 ) -> list[Certified]:
     """Certify policies of a run on this machine, and store the results in the run.
 
@@ -96,8 +97,9 @@ def certify_run(
         task: name of the other task; None: none.
         overrides: its options, such as "task.options.frame_skip=5"; see `other_task`.
         workers: number of worker processes; None: one per core.
-        on_notice: called with a sentence about each repair of the run, and when the workers compile for more than two
-            seconds; by default, these are RuntimeWarnings.
+        on_notice: called with a sentence about each repair of the run, when the workers compile for more than two
+            seconds, and when the first is replaced by a new process; by default, these are RuntimeWarnings.
+        on_output: called with the lines that workers print; see `run`.
 
     Returns:
         The policies that remain, in the order of selection.
@@ -122,7 +124,8 @@ def certify_run(
         if not chosen:
             why = "its map is empty" if top else "no candidate is named"
             raise NotInRunError(f"{run.folder}: there is no policy to certify; {why}", run=run.folder)
-        certified = _certify(config, different(chosen), store.next_certification, episodes, keep, by, other, on_notice)
+        given, number = different(chosen), store.next_certification
+        certified = _certify(config, given, number, episodes, keep, by, on_output, on_notice, other)
         return add_certified(store, certified, on_notice, generation)
 
 
@@ -177,6 +180,7 @@ def certify(
     observation_mean: ArrayLike | None = None,
     observation_std: ArrayLike | None = None,
     workers: int | None = None,
+    on_output: Callable[[str], None] = lambda line: None,
 ) -> list[Certified]:
     """Certify policies of another program on this machine, by the rules of `certify_run`; nothing is stored.
 
@@ -187,6 +191,7 @@ def certify(
             number if the policies have been changed after a look at the results.
         observation_mean, observation_std: statistics with which observations are normalised, [O] or [N, O]; None: 0 and
             1.
+        on_output: called with the lines that workers print; see `run`.
 
     Returns:
         The policies that remain, in the order of selection; `name` is the index of a policy in `parameters`.
@@ -202,7 +207,7 @@ def certify(
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
     given = [Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
-    return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by)
+    return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by, on_output)
 
 
 def _certify(
@@ -212,8 +217,9 @@ def _certify(
     episodes: int,
     keep: int,
     by: Measure | None,
+    on_output: Callable[[str], None],
+    on_notice: Callable[[str], None] = lambda sentence: None,
     other: OtherTask | None = None,
-    on_compile: Callable[[str], None] = lambda sentence: None,
 ) -> list[Certified]:
     """Select among candidates, then certify those that remain, in another task, too, if there is one."""
     measure, platform = _measure(config, by), platform_of(config, other)
@@ -222,15 +228,15 @@ def _certify(
     def reported(engine: Evaluator) -> list[EpisodesResult]:
         return results_of(engine, policies, episodes, seed, number, 0, domain)
 
-    with workers_for(config, on_compile) as engine:
+    with workers_for(config, on_notice, on_output) as engine:
         ranked, steps = halved(engine, [named.policy for named in given], config.seed, number, keep, measure)
         policies = [given[record.index].policy for record in ranked]
         results = reported(engine) if other is None else []
     elsewhere: list[Elsewhere | None] = [None] * len(ranked)
     if other is not None:
-        with workers_for(config, on_compile, compared=True) as engine:
+        with workers_for(config, on_notice, on_output, compared=True) as engine:
             results = reported(engine)
-        with workers_for(other.config, on_compile, compared=True) as engine:
+        with workers_for(other.config, on_notice, on_output, compared=True) as engine:
             elsewhere = [elsewhere_of(other, *pair) for pair in zip(results, reported(engine), strict=True)]
     certified = []
     for rank, (record, result) in enumerate(zip(ranked, results, strict=True)):
@@ -279,11 +285,16 @@ def different(chosen: Sequence[Candidate]) -> list[Named]:
 
 
 def workers_for(
-    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None, *, compared: bool = False
+    config: RunConfig,
+    on_notice: Callable[[str], None] = lambda sentence: None,
+    on_output: Callable[[str], None] = lambda line: None,
+    *,
+    compared: bool = False,
 ) -> AbstractContextManager[Evaluator]:
     """Workers on this machine that give what certification keeps.
 
     Args:
+        on_notice, on_output: as for `engine_here`.
         compared: whether the episodes are compared with those of another task: then they begin as there as far as they
             can, and have their first observations.
     """
@@ -291,7 +302,7 @@ def workers_for(
     outputs = outputs_of(task)
     if compared and task.parameters is None:
         outputs = (*outputs, FIRST_OBSERVATION)
-    return engine_here(config, on_compile, outputs=outputs, keyed_resets=compared)
+    return engine_here(config, on_notice, on_output, outputs=outputs, keyed_resets=compared)
 
 
 def outputs_of(task: TaskSpec) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Report, WorkerSpec
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.protocol.process_environment import require_no_import_of_a_task
+from es_service.runs.reports import reader_of_reports
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.worker_count import work_at_once, worker_count
 from workers.actor import WorkerActor
@@ -123,7 +124,8 @@ def make_engine(
 @contextmanager
 def engine_here(
     config: RunConfig,
-    on_compile: Callable[[str], None] = lambda sentence: None,
+    on_notice: Callable[[str], None] = lambda sentence: None,
+    on_output: Callable[[str], None] = lambda line: None,
     *,
     at_once: int | None = None,
     outputs: tuple[str, ...] = (),
@@ -132,16 +134,19 @@ def engine_here(
     """The engine of a config that computes on this machine, until the end of the block or a signal.
 
     Args:
-        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
+        on_notice: called with a sentence when workers compile, or make environments, for more than two seconds, and
+            when the first one is replaced by a new process.
+        on_output: called with the lines that workers print; see `api.run`.
         at_once, outputs, keyed_resets: as for `make_engine`.
     """
 
     def tell(sentence: str) -> None:
         if sentence:
-            on_compile(sentence)
+            on_notice(sentence)
 
     given = {"at_once": at_once, "outputs": outputs, "keyed_resets": keyed_resets}
-    with stop_on_signals() as should_stop, make_engine(config, should_stop, on_compile=tell, **given) as engine:
+    told = {"on_compile": tell, "on_report": reader_of_reports(on_notice, on_output)}
+    with stop_on_signals() as should_stop, make_engine(config, should_stop, **told, **given) as engine:
         yield engine
 
 

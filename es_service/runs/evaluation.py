@@ -170,7 +170,8 @@ def evaluate(
     episodes: int,
     workers: int | None = None,
     seed: int = 0,
-    on_compile: Callable[[str], None] = lambda sentence: None,
+    on_notice: Callable[[str], None] = lambda sentence: None,
+    on_output: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Fresh]:
     """Evaluate each candidate on fresh, noise-free episodes on this machine; yield the results in order.
 
@@ -178,7 +179,7 @@ def evaluate(
         episodes: number of episodes per candidate.
         workers: number of worker processes; None: one per core.
         seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
-        on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
+        on_notice, on_output: as for `engine_here`.
 
     Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM; ConfigError as
     `evaluation_config`.
@@ -188,7 +189,7 @@ def evaluate(
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     task = task_of(config)
     outputs = ("success",) if task.success else ()
-    with engine_here(config, on_compile, at_once=chunks * len(chosen), outputs=outputs) as engine:
+    with engine_here(config, on_notice, on_output, at_once=chunks * len(chosen), outputs=outputs) as engine:
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]

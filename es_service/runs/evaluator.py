@@ -32,6 +32,7 @@ from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.engine import make_engine
+from es_service.runs.reports import reader_of_reports
 from es_service.runs.session import initial_policy
 
 _LOG = logger(__name__)
@@ -220,6 +221,7 @@ def evaluator(
     engine: Literal["inline", "ray"] | None = None,
     address: str | None = None,
     transitions: bool = False,
+    on_output: Callable[[str], None] = lambda line: None,
 ) -> Evaluating:
     """Start the workers of a config and evaluate policies with them; at the end of the block, the workers end.
 
@@ -237,11 +239,12 @@ def evaluator(
             None: as configured.
         transitions: whether results have all steps of the episodes. They travel from the workers and stay in memory:
             4 (O + A + B + 1) + 1 bytes for each step: 497 of AntTrap, 33 of PointMaze.
+        on_output: called with the lines that workers print, during calls; see `run`.
 
     Raises:
         ConfigError: the config is wrong. EvaluationError: the workers cannot be started.
     """
-    return Evaluating(lambda: _started(config, workers, engine, address, transitions))
+    return Evaluating(lambda: _started(config, workers, engine, address, transitions, on_output))
 
 
 def transitions_of(result: EpisodesResult) -> Transitions:
@@ -297,14 +300,25 @@ def statistics_of(
 
 
 def _started(
-    config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None, transitions: bool
+    config: RunConfig | Source,
+    workers: int | str | None,
+    engine: str | None,
+    address: str | None,
+    transitions: bool,
+    on_output: Callable[[str], None],
 ) -> PolicyEvaluator:
     """See `evaluator`."""
     config = evaluating_config(config, workers, engine, address)
     task = task_of(config)
     outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
     start = partial(
-        make_engine, config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs
+        make_engine,
+        config,
+        on_wait=_tell_wait,
+        on_refusal=_LOG.warning,
+        on_report=reader_of_reports(_LOG.warning, on_output),
+        at_once=ANY_NUMBER,
+        outputs=outputs,
     )
     return PolicyEvaluator(config, task, start)
 

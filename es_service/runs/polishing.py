@@ -50,7 +50,13 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
 
 
 def certified_for(
-    run: Run, config: RunConfig, on_notice: Callable[[str], None], *, workers: int | None, centre: bool = False
+    run: Run,
+    config: RunConfig,
+    on_notice: Callable[[str], None],
+    on_output: Callable[[str], None] = lambda line: None,
+    *,
+    workers: int | None,
+    centre: bool = False,
 ) -> list[Certified]:
     """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, of
     which none has decided that the run is over, and selected by the same measure before and after. What is not
@@ -77,4 +83,4 @@ def certified_for(
     if certified:
         newest = max(policy.number for policy in certified)
         return [policy for policy in certified if policy.number == newest]
-    return certify_run(run.folder, centre=centre, by=by, workers=workers, on_notice=on_notice)
+    return certify_run(run.folder, centre=centre, by=by, workers=workers, on_notice=on_notice, on_output=on_output)

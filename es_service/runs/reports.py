@@ -1,4 +1,4 @@
-"""What a session does with the reports of its workers: what they print, and why they are replaced by new processes."""
+"""What becomes of the reports of workers: what they print, and why they are replaced by new processes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ NOTED_S = 1.0
 
 
 def reader_of_reports(
-    lock: RunLock, on_notice: Callable[[str], None], on_output: Callable[[str], None]
+    on_notice: Callable[[str], None], on_output: Callable[[str], None], lock: RunLock | None = None
 ) -> Callable[[str, Report], None]:
     """Function of a worker's name and a report of it.
 
     Args:
-        lock: gets the newest lines, for `status`.
         on_notice: called with a sentence when a worker is replaced for the first time.
         on_output: called with each line that a worker has printed.
+        lock: gets the newest lines, for `status`; None: nobody else reads them.
     """
     newest: deque[str] = deque(maxlen=MOST_LINES)
     noted_s, replaced = 0.0, 0
@@ -33,7 +33,7 @@ def reader_of_reports(
         for line in report.printed.splitlines():
             newest.append(f"{worker}: {line}"[:MOST_LINE])
             on_output(f"{worker}: {line}")
-        if report.printed:
+        if report.printed and lock is not None:
             is_due = (now_s := time.monotonic()) >= noted_s + NOTED_S
             lock.note_output(newest, write=is_due)
             noted_s = now_s if is_due else noted_s

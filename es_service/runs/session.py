@@ -152,7 +152,7 @@ def work(
             tell_wait,
             tell,
             tell_compiling,
-            on_report=reader_of_reports(store.lock, tell, on_output),
+            on_report=reader_of_reports(tell, on_output, store.lock),
         ) as engine,
     ):
 

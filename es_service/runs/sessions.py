@@ -135,7 +135,7 @@ def _to_target(config: RunConfig, outcome: Outcome, listener: Listener, *, stric
     """Certify the best centre whenever a session has ended for that, and continue: if it reaches the target, no longer
     than until the next session has opened the run."""
     while outcome.reason == targets.TO_CERTIFY:
-        targets.certify_best(outcome.run.folder, config, listener.on_notice)
+        targets.certify_best(outcome.run.folder, config, listener.on_notice, listener.on_output)
         _, outcome = yield from _session(outcome.run.folder, lambda store: config, listener, strict=strict)
     return outcome
 

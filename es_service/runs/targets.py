@@ -38,7 +38,9 @@ TO_CERTIFY = "the best centre may have reached budget.target_certified"
 """Reason of the Stop that ends a session before a certification."""
 
 
-def certify_best(folder: Path, config: RunConfig, on_notice: Callable[[str], None]) -> None:
+def certify_best(
+    folder: Path, config: RunConfig, on_notice: Callable[[str], None], on_output: Callable[[str], None]
+) -> None:
     """Decide whether the best centre of a run that no driver holds reaches the target; if so, certify it.
 
     Each result is stored at once. After an interruption, the next call begins with what is missing.
@@ -46,7 +48,7 @@ def certify_best(folder: Path, config: RunConfig, on_notice: Callable[[str], Non
     workers = None if config.compute.workers == "auto" or config.compute.address else config.compute.workers
     run, target = open_run(folder), config.budget.target_certified
     assert target is not None
-    with opened(run, workers, on_notice) as (store, local), workers_for(local, on_notice) as engine:
+    with opened(run, workers, on_notice) as (store, local), workers_for(local, on_notice, on_output) as engine:
         [best] = different(candidates(run, best=True, centre=False, cells=(), every=False))
 
         def episodes_of(policy: Parameters, number: int, domain: Domain) -> Episodes:

@@ -8,7 +8,7 @@ state is not kept: a kept state is only needed as a beginning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,7 +71,9 @@ class Recomputed:
     may, but need not, cause other bits."""
 
 
-def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterator[Recomputed]:
+def verify(
+    run: Run, generations: int = 1, workers: int | None = None, on_output: Callable[[str], None] = lambda line: None
+) -> Iterator[Recomputed]:
     """Compute generations of a run again on this machine and compare them with what is stored, bit for bit.
 
     The run is only read. Each kept state is a beginning, and so is the start of the run, unless it is a fork.
@@ -80,6 +82,7 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
         generations: number of generations to compute from each beginning, at most up to the next one. With the number
             of all generations, the whole run is computed again.
         workers: number of worker processes; None: one per core.
+        on_output: called with the lines that workers print; see `api.run`.
 
     Raises:
         RunLockedError: a driver is writing to the run, and so deletes states. This is raised at once, all others later.
@@ -88,10 +91,10 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
         Interrupted: SIGINT or SIGTERM arrived.
     """
     require_unlocked(run.folder)
-    return _verify(run, generations, workers)
+    return _verify(run, generations, workers, on_output)
 
 
-def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recomputed]:
+def _verify(run: Run, generations: int, workers: int | None, on_output: Callable[[str], None]) -> Iterator[Recomputed]:
     config = evaluation_config(run, workers)
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
     plan = _plan(run, generations)
@@ -102,7 +105,7 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
         task=task,
         statistics=lambda: initial_statistics(reader.read_start(run.folder)),
     )
-    with engine_here(config) as engine:
+    with engine_here(config, on_output=on_output) as engine:
         for begin, last in plan:
             reached, differences = _recompute(run, search, engine, begin, last)
             then = next((platform for first, platform in reversed(platforms) if first <= reached), {})
@@ -211,7 +214,9 @@ def _state_differences(
     return [f"state/{name}" for name in names if here.get(name) != at_generation.get(name)]
 
 
-def recomputed_certifications(run: Run, workers: int | None = None) -> Iterator[RecomputedCertification]:
+def recomputed_certifications(
+    run: Run, workers: int | None = None, on_output: Callable[[str], None] = lambda line: None
+) -> Iterator[RecomputedCertification]:
     """The stored certifications and decisions with what comes of their episodes on this machine now; first those in the
     run's task alone."""
     certified = all_certifications(run.folder)
@@ -219,23 +224,25 @@ def recomputed_certifications(run: Run, workers: int | None = None) -> Iterator[
         return
     config = evaluation_config(run, workers)
     if alone := [policy for policy in certified if policy.elsewhere is None]:
-        with workers_for(config) as engine:
+        with workers_for(config, on_output=on_output) as engine:
             for policy in alone:
                 changes = changes_since(policy.platform, platform_of(config))
                 yield RecomputedCertification(policy, _differing(engine, config, policy, policy.episodes), changes)
     for policy in certified:
         if policy.elsewhere is not None:
-            yield _recomputed_elsewhere(config, policy, policy.elsewhere)
+            yield _recomputed_elsewhere(config, policy, policy.elsewhere, on_output)
 
 
-def _recomputed_elsewhere(config: RunConfig, policy: Certified, elsewhere: Elsewhere) -> RecomputedCertification:
+def _recomputed_elsewhere(
+    config: RunConfig, policy: Certified, elsewhere: Elsewhere, on_output: Callable[[str], None]
+) -> RecomputedCertification:
     """What comes of the episodes of a policy in the run's task and in another one."""
-    with workers_for(config, compared=True) as engine:
+    with workers_for(config, on_output=on_output, compared=True) as engine:
         differences = _differing(engine, config, policy, policy.episodes)
     task, other, there, why = elsewhere.task, None, (), ""
     try:
         other = stored_task(config, elsewhere)
-        with workers_for(other.config, compared=True) as engine:
+        with workers_for(other.config, on_output=on_output, compared=True) as engine:
             there = _differing(engine, config, policy, elsewhere.episodes)
         if there and (where := why_task_does_not_repeat(other.config)):
             why = f"{task} does not repeat itself: with the same seed it returns other numbers {where}"

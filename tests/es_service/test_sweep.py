@@ -202,6 +202,7 @@ def test_options_that_contradict_each_other_are_refused(tmp_path):
         (("sweep", "point_maze_es", "--out", tmp_path / "a"), "a sweep needs --grid KEY=A,B or --seeds A:B"),
         (("sweep", "a", "b", "--out", tmp_path / "a", "--label", "c"), "--label: there are 1 for 2 configs"),
         (("run", "point_maze_es", "--seeds", "0:2", "--seed", 1), "--seed and --seeds cannot be combined"),
+        (("run", "point_maze_es", "--seeds", "0:2", "--show-output"), "--show-output and --seeds cannot be combined"),
         (("run", "point_maze_es", "--seeds", "0:2", "--set", "search.sigma=x", "--out", tmp_path), "sigma: x is not"),
     ):
         result = CliRunner().invoke(app, [str(word) for word in words])

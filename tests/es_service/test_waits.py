@@ -150,5 +150,5 @@ def test_a_run_says_that_its_workers_compile(tmp_path, monkeypatch, caplog):
     loads = "loading compiled code for point_maze (evaluation episodes, about 4 s)"
     for known in (said_first, loads):  # code that also says which succeed
         said.clear()
-        assert len(list(evaluation.evaluate(run, best, 1, on_compile=said.append))) == 1
+        assert len(list(evaluation.evaluate(run, best, 1, on_notice=said.append))) == 1
         assert said == [known]

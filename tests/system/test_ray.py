@@ -207,3 +207,19 @@ def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
 def test_a_gpu_that_is_not_there_is_named():
     with pytest.raises(EvaluationError, match=r"needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in total"):
         ray_engine(spec(), Limits(1), actor=WorkerActor, gpus=1.0)
+
+
+def test_what_an_actor_has_printed_before_it_ended_its_process_is_in_the_error(tmp_path):
+    config = {
+        "task": {"environment": "python:tests.workers.host_tasks:Deadly"},
+        "search": {"algorithm": "es", "pairs": 2, "evaluation_episodes": 2},
+        "map": {"enabled": False},
+        "budget": {"generations": 2},
+        "compute": {"engine": "ray", "workers": 1, "max_attempts": 1},
+    }
+    with pytest.raises(EvaluationError) as caught:
+        api.run(config, tmp_path / "run")
+    text = str(caught.value)
+    assert "its process or its node died" in text
+    assert "the last output of its process:\n" in text
+    assert "the licence has expired" in text.partition("the last output of its process:\n")[2]

@@ -151,10 +151,11 @@ class Undefined(Drift):
 
 
 class Deadly(Drift):
-    """A drift that ends its process in the fourth step."""
+    """A drift that ends its process in the fourth step, and says why."""
 
     def step(self, action):
         if self.steps == 3:
+            os.write(1, b"the licence has expired\n")
             os._exit(9)
         return super().step(action)
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from es_service import api, load_config
+from es_service import api, certify, certify_run, evaluator, load_config
 from es_service.cli.main import app
 from es_service.config.tasks import TASKS, task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol.messages import NO_CHOICES, EvaluationChunk, HostChoices, PolicySpec, TrainingChunk
+from es_service.protocol.messages import NO_CHOICES, EvaluationChunk, HostChoices, PolicySpec, Report, TrainingChunk
 from es_service.protocol.noise import (
     NORMAL_STD,
     Domain,
@@ -33,7 +33,7 @@ from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.engine import dispatch_limits
 from es_service.runs.replay import record
-from tests.helpers import centre, random_parameters, spec, workers_in_this_process
+from tests.helpers import centre, inline_here, random_parameters, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import host_tasks
 from workers.describe import does_not_repeat
@@ -333,6 +333,7 @@ def test_environments_that_end_their_worker_each_time_are_named_with_their_seeds
         EvaluationError, match=r"The resets of its episodes have the seeds (\d+), (\d+), (\d+)"
     ) as caught:
         api.run(config, tmp_path / "run", on_notice=[].append)
+    assert "the licence has expired" in str(caught.value)
     seeds = re.findall(r"have the seeds (\d+), (\d+), (\d+)$", str(caught.value), re.MULTILINE)[0]
     assert [int(seed) for seed in seeds] == [int(evaluation_reset_keys(0, 0, one)[0]) >> 1 for one in range(3)]
 
@@ -536,6 +537,38 @@ def test_workers_that_leak_are_replaced_and_what_they_print_is_seen_and_no_bit_c
     shown = CliRunner().invoke(app, ["status", str(tmp_path / "40")]).stdout
     assert re.search(r"newest lines .* printed:\n  worker \d+: reset with \d+\n", shown)
     api.resume(tmp_path / "40", {"task.recycle_after_episodes": 1000, "budget.generations": 5})
+
+
+def test_all_that_computes_tells_what_its_workers_print(tmp_path, monkeypatch):
+    def printing(*given, on_report, **others):
+        on_report("worker 0", Report("a limit was reached", ""))
+        return inline_here(*given, **others)
+
+    monkeypatch.setattr("es_service.runs.engine.inline_engine", printing)
+    lines, folder = [], str(tmp_path / "run")
+
+    def printed():
+        told = lines.copy()
+        lines.clear()
+        assert set(told) <= {"worker 0: a limit was reached"}
+        return len(told)
+
+    search = {"algorithm": "es", "pairs": 2, "evaluation_episodes": 2}
+    config = load_config(
+        config_of(DRIFT, search, workers=1), {"budget.generations": 2, "budget.target_certified": -1e6}
+    )
+    api.run(config, folder, on_output=lines.append)
+    assert printed() == 2, "a session, and the certification of its best centre"
+    certify_run(folder, top=0, episodes=2, on_output=lines.append)
+    certify(np.zeros((1, 41)), config, episodes=2, on_output=lines.append)
+    assert printed() == 2
+    with evaluator(config, on_output=lines.append) as evaluate:
+        assert (evaluate.parameters, printed()) == (41, 1)
+    for computing in (["evaluate"], ["evaluate", "--certify", "--top=0", "--episodes=2"], ["verify"]):
+        silent, telling = (CliRunner().invoke(app, [*computing, folder, *shown]) for shown in ([], ["--show-output"]))
+        assert silent.exit_code == telling.exit_code == 0
+        assert "a limit was reached" not in silent.output + telling.stdout
+        assert "worker 0: a limit was reached\n" in telling.stderr
 
 
 @pytest.mark.parametrize("is_new", [False, True])

@@ -91,7 +91,7 @@ def test_memory_is_that_of_a_process_and_of_all_that_it_has_started():
 
 def test_the_newest_lines_are_read_by_others_and_the_first_replacement_is_a_notice(tmp_path):
     lock, notices, lines = acquire_lock(tmp_path), [], []
-    read = reader_of_reports(lock, notices.append, lines.append)
+    read = reader_of_reports(notices.append, lines.append, lock)
     assert last_output(tmp_path) == ()
     read("worker 3", Report("a\nb", ""))
     assert (lines, last_output(tmp_path)) == (["worker 3: a", "worker 3: b"], ("worker 3: a", "worker 3: b"))
