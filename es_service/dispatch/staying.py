@@ -93,7 +93,7 @@ def workers() -> Iterator[None]:
 
     A worker that was lost, or was computing when its run ended, does not stay. Two processes wait for each core at
     most. What the code of a task has read from a file or changed in its modules stays, too. Blocks can be nested:
-    nothing is left running after the last one. Workers of a Ray cluster do not stay, and runs of `ask_tell` have none.
+    nothing is left running after the last one. Workers of Ray do not stay, and runs of `ask_tell` have none.
     """
     here = staying()
     here.enter()

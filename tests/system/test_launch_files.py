@@ -152,6 +152,7 @@ def test_containers_of_compose_are_limited_and_their_token_is_a_file():
         assert service["healthcheck"]["test"][:3] == ["CMD", "ray", "health-check"]
         assert service["deploy"]["resources"]["limits"]["memory"]
         assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"], "as allowPrivilegeEscalation: false says it"
 
 
 @pytest.mark.parametrize("extras", ["", "cluster,gymnasium"])
