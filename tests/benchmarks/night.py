@@ -13,10 +13,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import sys
 import tempfile
 import time
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -30,8 +32,12 @@ from tests.system.cluster import Cluster
 
 NIGHT = "ES_NIGHT"
 """Variable of the environment with which the simulator leaks, prints and crashes."""
-LEAK_BYTES = 2**18
-KILLS_S, LOOKS_S = (5.0, 30.0), 5.0
+LEAK_BYTES = 2**19
+"""What an episode leaks in every second process; in the others twice as much, so that some are replaced after their
+episodes and some for their memory."""
+STEP_S = 0.001
+"""Seconds that a step waits at night, as for a program beside it."""
+KILLS_S, LOOKS_S = (5.0, 60.0), 5.0
 """Seconds between two kills, and between two looks."""
 SEED = 7
 NODES = ("one", "two")
@@ -40,7 +46,8 @@ LIMIT_MB = 500
 
 
 class Leaky:
-    """A point that drifts. At night, each episode leaks, each step prints, and an episode of some thousands crashes."""
+    """A point that drifts. At night, each episode leaks, each step prints and waits, and an episode of a thousand
+    crashes."""
 
     observation_size, action_size, episode_steps = 2, 1, 60
     leaked: list[bytes] = []  # noqa: RUF012
@@ -50,8 +57,8 @@ class Leaky:
         self.random, self.place = np.random.default_rng(seed), 0.0
         self.is_night = NIGHT in os.environ
         if self.is_night:
-            self.leaked.append(os.urandom(LEAK_BYTES))
-            if not int.from_bytes(os.urandom(2)) % 5000:
+            self.leaked.append(os.urandom(LEAK_BYTES * (1 + os.getpid() % 2)))
+            if not int.from_bytes(os.urandom(2)) % 1000:
                 os.write(2, b"the solver has diverged\n")
                 os.abort()
         return [self.place, self.random.normal()]
@@ -60,12 +67,13 @@ class Leaky:
         """Drift."""
         self.place += 0.1 * float(action[0]) + 0.1 * self.random.normal()
         if self.is_night:
-            os.write(1, b"joint limit reached at %.3f, and much more text\n" % self.place)
+            os.write(1, b"joint limit reached at %.3f, and much more text\n" % self.place * 10)
+            time.sleep(STEP_S)
         return [self.place, self.random.normal()], -abs(self.place - 1.0), False
 
 
 CONFIG = {
-    "task": {"environment": "python:tests.benchmarks.night:Leaky", "recycle_after_episodes": 2000},
+    "task": {"environment": "python:tests.benchmarks.night:Leaky", "recycle_after_episodes": 400},
     "policy": {"hidden": [8]},
     "search": {"algorithm": "es", "pairs": 32, "evaluation_episodes": 4},
     "map": {"enabled": False},
@@ -74,8 +82,8 @@ CONFIG = {
 }
 
 
-def disturbed(folder: Path, minutes: float) -> tuple[int, pd.DataFrame]:
-    """A run on two nodes for this time: how many workers were killed, and a row for each look.
+def disturbed(folder: Path, minutes: float) -> tuple[dict[str, int], pd.DataFrame]:
+    """A run on two nodes for this time: how many workers were killed and replaced, and a row for each look.
 
     Raises RuntimeError with what the driver has printed if it ends otherwise than by its budget.
     """
@@ -87,6 +95,7 @@ def disturbed(folder: Path, minutes: float) -> tuple[int, pd.DataFrame]:
             hosts.start(node, 1, **{NIGHT: "1"})
         budget = f"budget.wall_clock_s={60 * minutes}"
         command = ["es-service", "run", folder / "night.yaml", "--set", budget, "--address", hosts.address]
+        command += ["--log-level", "info"]  # names each replacement
         # To a file, since a pipe that nobody reads would stop the driver.
         driver = hosts.popen("head", "sh", "-c", 'exec "$@" >"$0" 2>&1', printed, *command, "--out", out)
         began = time.monotonic()
@@ -113,7 +122,10 @@ def disturbed(folder: Path, minutes: float) -> tuple[int, pd.DataFrame]:
             )
     if driver.returncode:
         raise RuntimeError(printed.read_text(errors="replace")[-4000:])
-    return kills, pd.DataFrame(looks[:-1])  # the driver has ended before the last look
+    replacements = r"is replaced by a new process, since .*\.(\w+)\)$"
+    said = re.findall(replacements, printed.read_text(errors="replace"), re.MULTILINE)
+    replaced = {f"replaced_for_{key}": count for key, count in Counter(said).items()}
+    return {"killed": kills} | replaced, pd.DataFrame(looks[:-1])  # the driver has ended before the last look
 
 
 def _memory_mib(pid: int) -> float:
@@ -173,7 +185,7 @@ def main(minutes: float) -> None:
     """Print what a night gives."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        kills, looks = disturbed(folder, minutes)
+        counts, looks = disturbed(folder, minutes)
         of_minutes = looks.groupby(looks.minute.astype(int), as_index=False).max().round(1)
         of_minutes.to_csv(RESULTS / "night.csv", index=False)
         draw(of_minutes, RESULTS / "night.png")
@@ -182,7 +194,7 @@ def main(minutes: float) -> None:
         seen: dict[str, Any] = {
             "minutes": round(float(looks.minute.iloc[-1]), 1),
             **{column: looks[column].groupby(quarter).max().round(1).tolist() for column in looks.columns[1:-1]},
-            "killed": kills,
+            **counts,
             "lost_workers": int(night.history.lost_workers.sum()),
             "generations": night.generation,
         }
