@@ -9,7 +9,7 @@ CONFIG ?= configs/point_maze_memes.yaml
 START := $(shell date +%s)
 # The downloads of `run` and of `test`, as of 25 November 2026 on Linux x86-64 with Python 3.11 (sizes of the wheels).
 PACKAGES := 76 packages, about 375 MB
-PACKAGES_DEV := 179 packages, about 630 MB
+PACKAGES_DEV := 181 packages, about 630 MB
 
 .PHONY: run test tests quick long lint clean
 

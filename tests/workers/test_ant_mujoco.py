@@ -127,7 +127,9 @@ def test_a_control_step_is_that_of_c_mujoco(task: str, physics: str):
     if task == "ant_trap":
         ulp = np.spacing(np.abs(given.qpos[:, 0])) / STEP_S
         moved.append(truth._replace(reward=truth.reward + ulp))
-    print(f"\n{task}, {physics}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more")
+    print(
+        f"\n{task}, {physics}: {int((touches > 0).sum())} touch a wall, {int((touches > 2).sum())} three times or more"
+    )
     assert (touches > 0).mean() > 0.1
     for what in ("observation", "reward"):
         right = getattr(truth, what).reshape(len(touches), -1)
