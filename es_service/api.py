@@ -88,7 +88,9 @@ def run(
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
         on_generation: called with the history row of each generation after it is committed, or while another program
             holds the database, after it has begun to wait for that. If it returns `Stop("reason")`, the run ends there
-            with this reason, and can be resumed; other values have no effect.
+            with this reason, and can be resumed. A mapping from names to numbers that it returns, or
+            `Stop("reason", {...})`, records these as `metric_NAME` of the generation: columns of the history, curves,
+            metrics of trackers, and measures of comparisons. Other values have no effect.
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.

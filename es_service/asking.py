@@ -9,12 +9,13 @@ Axes: N rows, D policy parameters, O observation, A action, B descriptor dimensi
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,7 @@ from es_service.config.model import RunConfig
 from es_service.config.tasks import CALLER, task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
+from es_service.loop.history import Row
 from es_service.protocol.child import require_same_process
 from es_service.protocol.evaluator import Session
 from es_service.protocol.messages import (
@@ -38,7 +40,7 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
-from es_service.runs.session import OnNotice, Outcome, warn
+from es_service.runs.session import OnNotice, Outcome, checked_metrics, warn
 from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
@@ -122,10 +124,18 @@ class Asked:
 class AskTell:
     """A run whose episodes the caller computes; `ask_tell` makes one. To be used from one thread."""
 
-    def __init__(self, folder: Path, spec: WorkerSpec, dimensions: int, session: Session[Outcome]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        spec: WorkerSpec,
+        dimensions: int,
+        session: Session[Outcome],
+        metrics: dict[str, float],
+    ) -> None:
         """Begin nothing yet.
 
         Args:
+            metrics: gets those that are told; the session takes them when the generation is stored.
             dimensions: those of the descriptor.
             session: of the run, whose work is the caller's.
         """
@@ -135,6 +145,7 @@ class AskTell:
         self._session, self._spec, self._dimensions = session, spec, dimensions
         self._context, self._maker = copy_context(), os.getpid()  # the log's records of the caller are not the run's
         self._work: Sequence[Work] = ()
+        self._metrics = metrics
         self._asked: Asked | None = None
         self._last: Token | None = None
         """Of what was asked last."""
@@ -165,6 +176,7 @@ class AskTell:
         valid: ArrayLike | None = None,
         steps: ArrayLike | None = None,
         moments: tuple[float, ArrayLike, ArrayLike] | None = None,
+        metrics: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         """Tell the results of what was asked, in the order of its rows; when it returns, a generation that is complete
         has been committed, or waits for another program that holds the database, which a notice says. Results are told
@@ -179,6 +191,8 @@ class AskTell:
             steps: [N], environment steps of each, from 1 to 2**31 - 1; None: 1 each.
             moments: (count, mean [O], sum of squared deviations [O]) of all observations in the rows that train, for
                 the statistics with which observations are normalised; None: they stay.
+            metrics: numbers that are recorded with the generation to which these rows belong, by name, as those that
+                `on_generation` of `run` returns.
 
         Raises:
             ConfigError: an argument is wrong; `field` names it. Otherwise as `ask`.
@@ -213,6 +227,8 @@ class AskTell:
                 allowed = "finite numbers, and neither the count nor a square negative"
                 raise ConfigError(f"moments must be {allowed}", field="moments", allowed=allowed)
             observed = Moments(number, mean_O, m2_O)
+        if metrics:
+            self._metrics |= checked_metrics(metrics, self.run.meta, "metrics")
         self._asked = None
         distance_N_2 = np.full((count, 2), np.nan, np.float32)
         steps_N = steps_N.astype(np.int32)
@@ -290,15 +306,24 @@ def ask_tell(
             allowed=CALLER,
         )
     task = task_of(wanted)
+    metrics: dict[str, float] = {}
+
+    def told(row: Row) -> dict[str, float]:
+        """The metrics that were told since the last generation."""
+        given = dict(metrics)
+        metrics.clear()
+        return given
+
     listener = Listener(
-        lambda folder: nullcontext(lambda row: None),
+        lambda folder: nullcontext(told),
         on_notice,
         lambda sentence: None,
         lambda line: None,
         asks_caller=True,
     )
     session = begin_or_resume(wanted, folder, listener)
-    search = AskTell(folder, worker_spec(wanted, task, asks_caller=True), len(task.descriptor_names), session)
+    spec = worker_spec(wanted, task, asks_caller=True)
+    search = AskTell(folder, spec, len(task.descriptor_names), session, metrics)
     try:
         yield search
     finally:

@@ -19,7 +19,7 @@ from jax import lax
 
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
-from es_service.protocol.outputs import AT_THE_END, OF_STEPS
+from es_service.protocol.outputs import AT_THE_END, METRICS, OF_STEPS
 from workers.environments import Environment
 from workers.policies.policy import action, drawn_action, initial_memory, normalise
 from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
@@ -71,6 +71,11 @@ def _success(environment: Environment, state: Any, before: Any) -> Any:
     return jnp.asarray(environment.success(state, before), bool)
 
 
+def _metrics(environment: Environment, state: Any) -> Any:
+    assert environment.metrics is not None, "a run names this output only if its task has metrics"
+    return jnp.asarray(environment.metrics(state), jnp.float32)
+
+
 def _observation(environment: Environment, state: Any) -> Any:
     return jnp.asarray(environment.observe(state), jnp.float32)
 
@@ -89,6 +94,7 @@ OUTPUTS: Mapping[str, EpisodeOutput] = {
         lambda environment, state, _: _observation(environment, state), lambda environment, step, before: before
     ),
     "last_observation": _of_state(_observation),
+    METRICS: _of_state(_metrics),
     "observation": EpisodeOutput(
         lambda environment, state, _: _observation(environment, state),
         lambda environment, step, before: _observation(environment, step.before),

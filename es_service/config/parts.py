@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from es_service.protocol.low_rank import MOST_RANK
 from es_service.protocol.messages import Bounds
 from es_service.protocol.options import OptionValue
+from es_service.protocol.outputs import CHOSEN_METRIC
 
 TASK_OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."
@@ -79,6 +80,12 @@ Descriptor = Annotated[
     Text | tuple[Annotated[int, Field(ge=0)], ...],
     BeforeValidator(as_tuple),
     "a list of whole numbers, such as [0, 1], or the name of a key of info, or module:function",
+]
+
+Metrics = Annotated[
+    tuple[Annotated[str, Field(pattern=CHOSEN_METRIC)], ...],
+    BeforeValidator(as_tuple),
+    "a list of keys of info, such as [x_position, reward_ctrl:sum]",
 ]
 
 

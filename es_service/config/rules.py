@@ -37,7 +37,8 @@ MOST_PLACING_S = 600.0
 MOST_PARAMETERS = 80_000_000
 """The store keeps a centre and Adam's two moments, 12 bytes per parameter, in one value; SQLite allows 1e9 bytes."""
 MOST_DESCRIPTOR_DIMENSIONS = 973
-"""The history has two columns for each dimension and up to 51 others, and a table of SQLite 2,000 columns."""
+"""The history has two columns for each dimension and up to 51 others, and a table of SQLite 2,000 columns. Metrics of
+the task leave room for fewer."""
 MOST_CHUNK_PAIRS = CHUNK_PAIRS[1]
 PLACED = ("target", "nearness")
 """Kinds of objectives with a place among the descriptors."""
@@ -68,22 +69,22 @@ def descriptor_fits(config: Values, task: TaskSpec) -> Problems:
     if (chosen := config["task.descriptor"]) is not None and task.kind == "jax":
         why = f" for {task.name}, whose descriptor is its own"
         yield not_allowed("task.descriptor", chosen, "null", why=why)
-    if (dimensions := len(task.descriptor_names)) > MOST_DESCRIPTOR_DIMENSIONS:
+    room, dimensions = MOST_DESCRIPTOR_DIMENSIONS - -(-len(task.metric_names) // 2), len(task.descriptor_names)
+    if dimensions > room:
         key = "task.environment" if chosen is None else "task.descriptor"
         what = (
             f"the descriptor of {task.name} has {dimensions:,} dimensions; a run can store at most "
-            f"{MOST_DESCRIPTOR_DIMENSIONS}, since its history has two columns for each"
+            f"{room}, since its history has two columns for each"
         )
-        yield problem_of(key, config[key], what, allowed=f"at most {MOST_DESCRIPTOR_DIMENSIONS}")
+        yield problem_of(key, config[key], what, allowed=f"at most {room}")
 
 
 def choices_are_for_objects(config: Values, task: TaskSpec) -> Problems:
     if task.kind != "python":
         why = f" for {task.name}, which is no task of Python objects"
-        if (key := config["task.success"]) is not None:
-            yield not_allowed("task.success", key, "null", why=why)
-        if config["task.new_object_each_episode"]:
-            yield not_allowed("task.new_object_each_episode", True, "false", why=why)
+        for key, none in (("success", "null"), ("metrics", "[]"), ("new_object_each_episode", "false")):
+            if value := config[f"task.{key}"]:
+                yield not_allowed(f"task.{key}", value, none, why=why)
 
 
 def times_are_measured(config: Values, task: TaskSpec) -> Problems:

@@ -14,6 +14,7 @@ from es_service.config.parts import (
     CellCounts,
     Count,
     Descriptor,
+    Metrics,
     NotNegative,
     Number,
     Options,
@@ -57,6 +58,12 @@ class TaskConfig(Section):
         description="For tasks of Python objects: key of the last step's `info` that says whether an episode has "
         "succeeded. `null`: as the task says, or `is_success`.",
     )
+    metrics: Metrics = Field(
+        (),
+        description="For tasks of Python objects: keys of the steps' `info` that the run records as columns "
+        "`metric_KEY`, means over the evaluation episodes. `KEY` is the last value in an episode; `KEY:sum`, "
+        "`KEY:mean`, `KEY:min` and `KEY:max` are made of all its values.",
+    )
     new_object_each_episode: Switch = Field(
         False,
         description="For tasks of Python objects: whether each episode has a new object, for simulators that carry "
@@ -82,7 +89,7 @@ class TaskConfig(Section):
     @property
     def choices(self) -> HostChoices:
         """What is chosen for a task of Python objects."""
-        return HostChoices(self.descriptor, self.success, self.new_object_each_episode)
+        return HostChoices(self.descriptor, self.success, self.new_object_each_episode, self.metrics)
 
     @property
     def code(self) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from es_service.protocol.options import (
     is_plain,
     option_values,
 )
+from es_service.protocol.outputs import CHOSEN_METRIC
 from es_service.protocol.parameters import FREE, ParameterSpec
 from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
 from es_service.protocol.raised import RaisedError
@@ -78,7 +79,7 @@ def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
     )
 
 
-CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode")
+CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode", "task.metrics")
 """Keys of `HostChoices`."""
 OTHER_TASKS = (
     "brax:NAME, mujoco:ID, gymnasium:ID, gymnax:NAME, playground:NAME, python:module:Class, function:module:name, or "
@@ -222,9 +223,17 @@ def settings_of_task(values: Mapping[str, Any]) -> dict[str, Any]:
         descriptor if is_chosen else None,
         success if isinstance(success, str) and success else None,
         values.get("task.new_object_each_episode") is True,
+        chosen_metrics(values.get("task.metrics")),
     )
     options = {key: value for key, value in options_of(values).items() if is_plain(value)}
     return {"options": options, "choices": choices}
+
+
+def chosen_metrics(given: object) -> tuple[str, ...]:
+    """The metrics that a config chooses; none if the value is no list of such."""
+    keys = given if isinstance(given, list | tuple) else ()
+    are_valid = all(isinstance(key, str) and re.match(CHOSEN_METRIC, key) for key in keys)
+    return tuple(keys) if are_valid else ()
 
 
 def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:

@@ -10,6 +10,7 @@ from es_service.config.search import PopulationConfig
 from es_service.config.tasks import CALLER, ROLLOUTS
 from es_service.errors import ConfigError, counted
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, PolicySpec, TaskSpec, WorkerSpec
+from es_service.protocol.outputs import METRICS
 from es_service.protocol.policies import chunks_of
 from es_service.protocol.rollouts import Rollouts, why_not
 from es_service.protocol.sources import worker_sources
@@ -38,7 +39,7 @@ def worker_spec(
     """The message that every worker of the run receives once, when it starts.
 
     Args:
-        outputs: see `WorkerSpec.outputs`; those that the search reads are added.
+        outputs: see `WorkerSpec.outputs`; those that the search reads are added, and the metrics of the task.
         asks_caller: whether the caller computes the episodes of a task that has none of its own.
 
     Raises ConfigError as `require_episodes`.
@@ -65,7 +66,7 @@ def worker_spec(
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
         noise_rank=search.noise.rank if isinstance(search, PopulationConfig) else 0,
-        outputs=tuple(sorted({*outputs, *search.outputs()})),
+        outputs=tuple(sorted({*outputs, *search.outputs(), *((METRICS,) if task.metric_names else ())})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
         recycle_after_episodes=settings.recycle_after_episodes,
         memory_bytes=compute.worker_memory_mb and compute.worker_memory_mb * 2**20,

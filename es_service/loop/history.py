@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
+from es_service.protocol.outputs import METRICS
 
 HistoryRow = dict[str, int | float | None]
 """Values by name of the column, as the loop writes them."""
@@ -85,7 +86,7 @@ _CORRECTED = (
 CORRECTED = tuple(column.name for column in _CORRECTED)
 """Names of these columns, which a run has if `map.correct_every` is set."""
 METRIC = "metric_"
-"""Beginning of the columns of a search's own metrics."""
+"""Beginning of the columns of metrics: of the search, of the task, and of the program that runs a session."""
 _INFEASIBLE = Column("infeasible_members", "INTEGER", True, "members with a fitness of -inf, which are no invalid ones")
 _EPISODES = (
     Column("fitness_first", "REAL", False, "fitness of its first evaluation episode, which a replay shows"),
@@ -153,7 +154,14 @@ def history_columns(
     corrected = _CORRECTED if has_map and corrects else ()
     infeasible = (_INFEASIBLE,) if allows_infeasible else ()
     of_search = [Column(f"{METRIC}{name}", "REAL", True, f"metric of the search: {name}") for name in metrics]
-    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES, *_COSTS, *of_search)
+    more = *_of_task(task), *of_search
+    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *infeasible, *_SEARCH_AND_TIMES, *_COSTS, *more)
+
+
+def _of_task(task: TaskSpec) -> list[Column]:
+    """Columns of the task's metrics, which the history and the table of evaluated centres have."""
+    meaning = "metric of the task, mean over the evaluation episodes"
+    return [Column(f"{METRIC}{name}", "REAL", True, f"{meaning}: {name}") for name in task.metric_names]
 
 
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
@@ -175,6 +183,7 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
         Column("return_mean", "REAL", True, "mean return over the same episodes"),
         *(Column(name, "REAL", True, "mean descriptor over the same episodes") for name in task.descriptor_names),
         *(_GOAL_OF_CENTRE if task.has_goal else ()),
+        *_of_task(task),
         Column("novelty", "REAL", True, "novelty of its mean descriptor in the archive before the generation"),
         Column("update_norm", "REAL", True, "Euclidean norm of its step in this generation"),
         Column("env_steps", "INTEGER", True, "environment steps of its population and of its evaluation"),
@@ -260,8 +269,8 @@ def quartiles(values_N: NDArray[np.float64]) -> list[float]:
 
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
 def evaluation_columns(table: Table, episodes: EpisodesResult, row: int, task: TaskSpec) -> HistoryRow:
-    """Columns about the episodes of the centre that the history's row is about: fitness, return, descriptor and
-    distance to the goal.
+    """Columns about the episodes of the centre that the history's row is about: fitness, return, descriptor, distance
+    to the goal, and metrics of the task.
 
     Args:
         table: columns of all evaluated centres.
@@ -275,7 +284,7 @@ def evaluation_columns(table: Table, episodes: EpisodesResult, row: int, task: T
         **{f"centre_{name}": float(table[name][row]) for name in same},
         "centre_return_std": float(episodes.returns[row].astype(np.float64).std()),
         **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
-        **{name: float(table[name][row]) for name in goal},
+        **{name: float(table[name][row]) for name in (*goal, *(column.name for column in _of_task(task)))},
     }
 
 
@@ -290,7 +299,8 @@ def doubles(values_N_E: FloatArray) -> NDArray[np.float64]:
 
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
 def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArray[np.float64]]:
-    """Columns of the evaluated centres about their episodes, [N, E]: fitness, return, descriptor, distance to goal."""
+    """Columns of the evaluated centres about their episodes, [N, E]: fitness, return, descriptor, distance to the goal,
+    metrics of the task."""
     fitness_N_E, returns_N_E = doubles(episodes.fitness), doubles(episodes.returns)
     mean_N_B = doubles(episodes.descriptor).mean(axis=1)
     columns = {
@@ -305,6 +315,9 @@ def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArra
         columns["goal_distance"] = end_N_E.mean(axis=1)
         columns["goal_distance_way"] = least_N_E.mean(axis=1)
         columns["goal_distance_min"] = least_N_E.min(axis=1)
+    if task.metric_names:
+        mean_N_M = doubles(episodes.outputs[METRICS]).mean(axis=1)
+        columns |= {f"{METRIC}{name}": mean_N for name, mean_N in zip(task.metric_names, mean_N_M.T, strict=True)}
     return columns
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from es_service.config.model import RunConfig
@@ -47,6 +47,8 @@ class Stop:
 
     reason: str
     """Why the session ends, in words."""
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    """Numbers to be recorded of this generation, by name; as if they had been returned alone."""
 
     def __post_init__(self) -> None:
         """Raises ConfigError if there are no words, since every reader of the run shows them."""

@@ -99,6 +99,8 @@ class TaskSpec:
     `after another episode`; empty if it was not found to, or was not tried."""
     notes: tuple[str, ...] = ()
     """What its author probably did not intend, such as an attribute with an unknown name, in sentences."""
+    metric_names: tuple[str, ...] = ()
+    """Numbers that it records of each episode besides what every task has; see `outputs.METRICS`."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,8 @@ class HostChoices:
     """Key of the last `info` that says whether an episode has succeeded; None: as the task says."""
     new_objects: bool = False
     """Whether each episode has an object of its own."""
+    metrics: tuple[str, ...] = ()
+    """Keys of `info` that are metrics, each as KEY or KEY:TAKEN; see `outputs.CHOSEN_METRIC`."""
 
 
 NO_CHOICES = HostChoices()
@@ -365,7 +369,8 @@ class EpisodesResult:
     outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays.
 
-    success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step;
+    success: bool, whether the episode succeeded as the task declares it; metrics [..., M]: those that the task
+    records, in the order of `TaskSpec.metric_names`, float32; last_reward: reward of the last valid step;
     last_observation [..., O]: observation after it; first_observation [..., O]: that of the reset. A member has the
     mean of its episodes, float32."""
     of_steps: Mapping[str, NDArray[Any]] = field(default_factory=dict)

@@ -87,7 +87,7 @@ def measure_named(column: str) -> Measure:
             return Measure(column[:1].upper() + column[1:], column, note)
     if column.startswith(METRIC):
         name = column.removeprefix(METRIC)
-        return Measure(name, name, "Metric of the search.")
+        return Measure(name, name, "A metric that the run records; greater values count as better.")
     return MEASURES.get(column) or Measure(column, column, "")
 
 
@@ -127,14 +127,14 @@ def has_values(run: RunData, column: str) -> bool:
 
 
 def with_derived(history: Columns, certified: Sequence[Mapping[str, Any]], fitness: str) -> Columns:
-    """A history with the columns of certifications, and in which corrected columns hold until the next correction.
+    """A history with the columns of certifications, in which corrected values and metrics hold until the next ones.
 
     Args:
         certified: what `certified_over_time` returns; the value holds from the generation on from which a policy was
             taken, or from the last one, if that is not known.
         fitness: `task.fitness`.
     """
-    derived = {name: held(history[name]) for name in CORRECTED if name in history}
+    derived = {name: held(history[name]) for name in history if name in CORRECTED or name.startswith(METRIC)}
     steps_G, value = history["env_steps"], f"{measure_of(fitness)}_mean"
     if not steps_G.size:
         return history

@@ -71,6 +71,10 @@ class _Spec(NamedTuple):
     percent: bool = False
 
 
+_OF_METRICS = (
+    "Metric of the search, of the task (mean over the evaluation episodes of the {evaluated}), or of the program that "
+    "ran the session."
+)
 QD_ABOVE_LEAST = "qd_score_above_least"
 """Column of `qd_columns`."""
 # {evaluated} is what `evaluated_word` says of the newest generation, {below} what `qd_columns` says.
@@ -149,7 +153,7 @@ def charts(history: Columns, centres: Columns, qd_offset: float) -> list[Chart]:
     word = evaluated_word(newest) if newest else "centre"
     chart_list = []
     own = [
-        _Spec(name.removeprefix(METRIC), "Metric of the search.", ((name.removeprefix(METRIC), name, "mean"),))
+        _Spec(name.removeprefix(METRIC), _OF_METRICS, ((name.removeprefix(METRIC), name, "mean"),))
         for name in history
         if name.startswith(METRIC)
     ]

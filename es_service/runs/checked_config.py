@@ -6,7 +6,6 @@ A config that its search refuses fails here, before a folder is created or a wor
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -25,6 +24,7 @@ from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import LATER, Column, evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import defaults_of
+from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.runs.identity import require_unchanged
 from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.view import open_run
@@ -79,7 +79,7 @@ def accepted(config: RunConfig) -> RunConfig:
     return config
 
 
-KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
+KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal", "metric_names")
 """Fields of a task that the policies and the history of a run depend on."""
 
 
@@ -131,12 +131,12 @@ def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tupl
     """The columns of a run's history, and those of its evaluated centres."""
     has_map, corrects = config.map.enabled, config.map.correct_every is not None
     metrics = sorted(ALGORITHMS[config.search.algorithm](config).metrics)
-    if wrong := [name for name in metrics if re.fullmatch(r"[a-z][a-z0-9_]{0,39}", name) is None]:
+    if wrong := wrong_metric_names(metrics) or wrong_metric_names([*task.metric_names, *metrics]):
         raise ConfigError(
-            f"search.algorithm: {config.search.algorithm} has a metric {wrong[0]!r}; its name must be of up to 40 "
-            "small letters, digits and _, a letter first",
+            f"search.algorithm: {config.search.algorithm} has a metric {wrong[-1]}; its name must be of {METRIC_FORM}, "
+            "and no other metric of the search or of the task may have it",
             field="search.algorithm",
-            value=wrong[0],
+            value=wrong[-1],
         )
     history = history_columns(task, has_map, corrects, config.search.allow_infeasible, metrics)
     return history, evaluated_columns(task, has_map)
@@ -153,8 +153,9 @@ def _budget_of_a_fork(config: RunConfig, status: RunStatus) -> dict[str, Any]:
 
 def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
     """Differences between the recorded task and the present one that the run's data depend on; empty if none."""
-    present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
-    values = [(name, recorded[name], present[name]) for name in KEPT_OF_A_TASK]
+    lists = {name: list(getattr(task, name)) for name in ("descriptor_names", "metric_names")}
+    present, before = asdict(task) | lists, {"metric_names": [], **recorded}  # which older versions did not record
+    values = [(name, before[name], present[name]) for name in KEPT_OF_A_TASK]
     return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
 
 

@@ -137,7 +137,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     contents = {name: snapshot.contents[name] for name in names_of(blocks)}
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     history, evaluations = (_in_pieces(read, origin, at) for read in (reader.read_history, reader.read_evaluations))
-    return _lineage(origin, at), Beginning(history, blocks, contents, platforms, newest=at, evaluations=evaluations)
+    metrics = reader.read_metrics(origin.folder, at)
+    beginning = Beginning(history, blocks, contents, platforms, newest=at, metrics=metrics, evaluations=evaluations)
+    return _lineage(origin, at), beginning
 
 
 def _in_pieces(read: Callable[[Path, int, int], Sequence[Any]], origin: Run, newest: int) -> Iterator[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -14,13 +15,24 @@ from es_service.config.sections import MapConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import parallel_sentence, policy_spec
 from es_service.dispatch.dispatch_log import Committed, dispatch_log
-from es_service.errors import Action, EvaluationError, Interrupted, ServiceError, StoreError, WayOut, counted
+from es_service.errors import (
+    Action,
+    ConfigError,
+    EvaluationError,
+    Interrupted,
+    ServiceError,
+    StoreError,
+    WayOut,
+    counted,
+)
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
-from es_service.loop.history import evaluated_word
+from es_service.loop.history import METRIC, evaluated_word
+from es_service.loop.interfaces import Stop
 from es_service.protocol.evaluator import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
+from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.runs.engine import make_engine
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.reports import reader_of_reports
@@ -33,6 +45,7 @@ from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.lock import RunLock
+from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from workers.policies.policy import initial_parameters
 
@@ -41,7 +54,7 @@ LONG_PLACING_S = 2.0
 """Time from which on it is said that centroids are placed."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
 """Called with each history row after its generation is committed, or has begun to wait for that (`runs/waiting.py`). A
-`Stop` that it returns ends the session."""
+`Stop` that it returns ends the session, and numbers by name are recorded; see `metrics_of`."""
 OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
@@ -173,6 +186,9 @@ def work(
                 who = "a worker" if lost == 1 else counted(lost, "worker")
                 tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
             answer = on_generation(row)
+            given = answer.metrics if isinstance(answer, Stop) else answer
+            if isinstance(given, Mapping) and given:
+                kept.record(row["generation"], checked_metrics(given, store.meta, "on_generation"))
             _LOG.info(
                 "%s fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
                 evaluated_word(row),
@@ -199,6 +215,37 @@ def work(
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)
     return Outcome(open_run(store.folder), reason, driver.is_finished(config.budget, state))
+
+
+def checked_metrics(given: Mapping[str, Any], meta: RunMeta, field: str) -> dict[str, float]:
+    """Metrics that a caller records, as numbers.
+
+    Args:
+        field: function or argument that they come from.
+
+    Raises ConfigError for a name that no metric can have, or that is one of the search or of the task, and for a value
+    that is no number.
+    """
+    of_run = [column.name.removeprefix(METRIC) for column in meta.columns if column.name.startswith(METRIC)]
+    if wrong := wrong_metric_names(given) or wrong_metric_names([*of_run, *given]):
+        raise ConfigError(
+            f"{field}: a metric is named {wrong[-1]}; its name must be of {METRIC_FORM}, and no metric of the search "
+            "or of the task may have it",
+            field=field,
+            value=wrong[-1],
+        )
+    metrics = {}
+    for name, value in given.items():
+        try:
+            metrics[name] = math.nan if value is None else float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise ConfigError(
+                f"{field}: the metric {name} is {value!r}; it must be a number (NaN for none)",
+                field=field,
+                value=value,
+                allowed="a number",
+            ) from None
+    return metrics
 
 
 def _placing_sentence(config: MapConfig) -> str:

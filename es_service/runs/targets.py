@@ -135,7 +135,9 @@ def until_due(
 
     def answer(row: Mapping[str, Any]) -> object:
         given = on_generation(row)
-        return Stop(TO_CERTIFY) if not isinstance(given, Stop) and is_due(row) else given
+        if isinstance(given, Stop) or not is_due(row):
+            return given
+        return Stop(TO_CERTIFY, given if isinstance(given, Mapping) else {})
 
     return answer
 

@@ -27,7 +27,7 @@ from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import Row
 from es_service.runs.session import OnNotice
 from es_service.runs.view import Run, open_run
-from es_service.store.reader import read_history
+from es_service.store.reader import read_history, records_metrics
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 """Name of a tracker, which is also that of the extra of this package -> the module that it needs."""
@@ -74,9 +74,17 @@ def open_tracker(name: str, run: Run) -> Tracker:
     return made[name](run)
 
 
-def fill(tracker: Tracker, run: Run, newest: int) -> int:
-    """Send the rows after generation `newest` to a tracker; returns the newest generation that was sent."""
+def fill(tracker: Tracker, run: Run, newest: int, *, has_ended: bool = True) -> int:
+    """Send the rows after generation `newest` to a tracker; returns the newest generation that was sent.
+
+    Args:
+        has_ended: whether the session has. If not, and metrics are recorded, the last row waits for those of its own.
+    """
     while rows := read_history(run.folder, newest + 1, MOST_ROWS):
+        if not has_ended and len(rows) < MOST_ROWS and records_metrics(run.folder):
+            rows.pop()
+        if not rows:
+            break
         tracker.log(rows)
         newest = int(rows[-1]["generation"])
     return newest
@@ -296,12 +304,10 @@ def _follow(
         run = open_run(folder)
         tracker = opened(name, run)
         newest = tracker.newest()
-        while True:
-            last = ended.is_set()  # read before the history, so that its last row is not missed
-            newest = fill(tracker, run, newest)
-            if last:
-                break
-            ended.wait(PAUSE_S)
+        last = False
+        while not last:
+            last = ended.wait(PAUSE_S)  # first, so that metrics of the first generation are recorded by then
+            newest = fill(tracker, run, newest, has_ended=last)
         tracker.close()
     except Exception as error:  # whatever a tracker raises must not end the run
         reason = str(error).partition("\n")[0]

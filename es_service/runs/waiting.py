@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -71,6 +71,7 @@ class PatientStore:
         self._store, self._recorder = store, recorder
         self._should_stop, self._tell, self._on_commit = should_stop, tell, on_commit
         self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table, Contents]]] = deque()
+        self._metrics: dict[int, Mapping[str, float]] = {}
         self._bytes, self._again_s, self._is_held = 0, 0.0, False
         self._told: set[str] = set()
 
@@ -105,6 +106,12 @@ class PatientStore:
         while self._bytes > MOST_BYTES and not self.store_waiting(PATIENCE_S):
             self._pause()
 
+    def record(self, generation: int, metrics: Mapping[str, float]) -> None:
+        """Store metrics of a generation that was given, or let them wait with it."""
+        self._metrics[generation] = metrics
+        if not self._waiting:
+            self.store_waiting(PATIENCE_S)
+
     def store_waiting(self, patience_s: float) -> bool:
         """Store what waits, the oldest first; return whether nothing waits any longer."""
         try:
@@ -115,6 +122,9 @@ class PatientStore:
                     self._waiting.popleft()
                     self._bytes -= size
                     self._on_commit(generation[0])
+                for at in list(self._metrics):
+                    self._store.record_metrics(at, self._metrics[at])
+                    del self._metrics[at]
         except DatabaseHeldError:
             self._hold()
             return False

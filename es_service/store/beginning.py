@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service.store import metrics
 from es_service.store.codec import (
     Part,
     Values,
@@ -55,6 +56,8 @@ class Beginning:
     """Arrays from which generation 0 starts; `RunStore.start` returns them."""
     newest: int = -1
     """Last generation that is taken from the parent; -1 if there is none."""
+    metrics: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
+    """Metrics that were recorded in the parent, by generation and by name; a column of this run replaces its own."""
     evaluations: Iterable[Sequence[Values]] = ()
     """The centres that each of these generations evaluated, likewise; none if it ends early."""
 
@@ -78,6 +81,10 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
             insert_history(connection, meta, generation, values, b"".join(evaluated), state)
         for generation, platform in beginning.platforms:
             record(connection, generation, platform)
+        columns = {column.name for column in meta.columns}
+        for generation, named in beginning.metrics.items():
+            new = {name: value for name, value in named.items() if columns.isdisjoint(metrics.row({name: value}))}
+            metrics.record(connection, generation, new)
         if beginning.start is not None:
             put_meta(connection, _START, base64.b64encode(encode_part(beginning.start)).decode())
 

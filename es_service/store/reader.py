@@ -7,14 +7,14 @@ functions that take a folder raise StoreError as `reading` does, and if what the
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
-from es_service.store import certifications
+from es_service.store import certifications, metrics
 from es_service.store.beginning import load_start
 from es_service.store.certifications import CertifiedRow
 from es_service.store.codec import Row, row_dict
@@ -54,7 +54,7 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
     """The newest history row; None if there is none. No other row is read."""
     with reading(folder) as (connection, meta):
         rows = [*_sound_rows(connection, meta, newest_generation(connection) or 0)]
-        return row_dict(meta.columns, rows[-1].row) if rows else None
+        return _with_metrics(connection, meta, rows)[-1] if rows else None
 
 
 def read_history(
@@ -68,8 +68,17 @@ def read_history(
         limit: greatest number of rows; None for all rows.
     """
     with reading(folder) as (connection, meta):
-        rows = _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
-        return [row_dict(meta.columns, stored.row) for stored in rows]
+        return _with_metrics(connection, meta, [*_sound_rows(connection, meta, max(since_generation or 0, 0), limit)])
+
+
+def _with_metrics(
+    connection: sqlite3.Connection, meta: RunMeta, rows: Sequence[HistoryRow]
+) -> list[dict[str, int | float]]:
+    """History rows as values by column name, with the metrics that were recorded."""
+    if not rows:
+        return []
+    found = metrics.sound(connection, rows[0].generation, len(rows))
+    return [row_dict(meta.columns, stored.row) | metrics.row(found.get(stored.generation, {})) for stored in rows]
 
 
 def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
@@ -78,7 +87,20 @@ def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
         table = GrowingTable(meta.columns)
         for stored in _sound_rows(connection, meta, 0, limit):
             table.add(stored.row)
-        return table.columns()
+        history = table.columns()
+        return history | metrics.columns(metrics.sound(connection, 0, limit), history["generation"])
+
+
+def records_metrics(folder: Path) -> bool:
+    """Whether a program has recorded metrics in the run."""
+    with reading(folder) as (connection, _):
+        return metrics.are_there(connection)
+
+
+def read_metrics(folder: Path, newest: int) -> dict[int, dict[str, float]]:
+    """Metrics that were recorded up to generation `newest`, by generation and by name."""
+    with reading(folder) as (connection, _):
+        return metrics.sound(connection, 0, newest + 1)
 
 
 def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None = None) -> list[EvaluatedCentres]:

@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from es_service.errors import StoreError
-from es_service.store import certifications
+from es_service.store import certifications, metrics
 from es_service.store.connection import connected_to
 from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file
@@ -112,6 +112,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
         connection.execute("REINDEX content")
         collect_contents(connection)
         certifications.remove(connection, verdict.bad_certifications)
+        metrics.remove(connection, verdict.good)
     if verdict.good == verdict.newest:
         notices.append(
             f"{file}: {damage}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"

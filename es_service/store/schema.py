@@ -19,6 +19,8 @@ from es_service.store.facts import Damaged, RunFacts, column_problem, facts, req
 SCHEMA = "schema_version"
 """Record of the table `meta` with the schema version."""
 SCHEMA_VERSION = 8
+SCHEMA_WITH_METRICS = 9
+"""That of runs with the table `metric`, which version 0.27 does not know."""
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0", 6: "0.25.0", 7: "0.25.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
@@ -42,6 +44,7 @@ _CERTIFICATION = (
     "CREATE TABLE certification (number INTEGER NOT NULL, rank INTEGER NOT NULL, facts TEXT NOT NULL, "
     "payload BLOB NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (number, rank)) WITHOUT ROWID"
 )
+METRICS = "CREATE TABLE metric (generation INTEGER PRIMARY KEY, named TEXT NOT NULL, sha256 TEXT NOT NULL)"
 OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
 """Columns of the table history besides those of the run: the evaluated centres (`tables.table_bytes`), the SHA-256 of
 the state, and that of the row."""
@@ -138,10 +141,10 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
             raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
     records = {key: value for key, value, _ in rows}
     version = facts(records.get(SCHEMA, "0"), int, "its schema version")
-    if version > SCHEMA_VERSION:
+    if version > SCHEMA_WITH_METRICS:
         raise StoreError(
             f"{file} has schema version {version}; this version of es-service supports versions up to "
-            f"{SCHEMA_VERSION}. Upgrade es-service to read or continue the run."
+            f"{SCHEMA_WITH_METRICS}. Upgrade es-service to read or continue the run."
         )
     if version < 1 or "run" not in records:
         raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")
@@ -154,7 +157,7 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
     require_form(fields["task"], TaskSpec, "its description of the task")
     columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
     meta = RunMeta(**fields | columns)
-    if tables != table_statements(meta.columns):
+    if tables.pop("metric", METRICS) != METRICS or tables != table_statements(meta.columns):
         raise Damaged("its tables are not those of a run")
     return meta
 

@@ -16,6 +16,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
+from es_service.store import metrics
 from es_service.store.codec import row_dict
 from es_service.store.connection import connected_to, reading
 from es_service.store.facts import GENERATION, Damaged
@@ -111,6 +112,13 @@ class Followed:
             # Nothing can be added to a table whose columns are in use.
             history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
             newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
+            with _noted(problems, "the recorded metrics cannot be read"):
+                found, damaged = metrics.recorded(connection)
+                history |= metrics.columns(found, history["generation"])
+                newest = newest and newest | metrics.row(found.get(int(newest["generation"]), {}))
+                if damaged:
+                    which = _spans([range(at, at + 1) for at in damaged])
+                    problems.append(f"the metrics recorded at generations {which} are damaged")
             return SoundRun(
                 meta, history, newest, evaluations, platforms, generation, parts, self._contents, tuple(problems)
             ), whole

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from es_service.protocol.content import names_in
-from es_service.store import certifications
+from es_service.store import certifications, metrics
 from es_service.store.beginning import load_start
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
 from es_service.store.facts import Damaged
@@ -98,6 +98,8 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         problems.append(f"{which} not complete and intact")
     bad_certified = [key for key, row in certifications.rows(connection) if row is None]
     problems += [f"row {rank} of certification {number} is damaged" for number, rank in bad_certified]
+    damaged = metrics.recorded(connection)[1]
+    problems += [f"the metrics recorded at generation {at} are damaged" for at in damaged]
     return Verdict(meta, newest, good, kept, named, tuple(bad_rows), tuple(bad_certified), tuple(problems))
 
 

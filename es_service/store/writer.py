@@ -24,7 +24,7 @@ from es_service.logs import logger
 from es_service.loop.history import LATER, Table
 from es_service.protocol.child import require_same_process
 from es_service.protocol.content import names_in
-from es_service.store import certifications
+from es_service.store import certifications, metrics
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
 from es_service.store.create import create_run_folder
@@ -260,6 +260,12 @@ class RunStore:
         with self._transaction("storing a certification") as connection:
             certifications.insert(connection, number, policies)
         self.upkeep.after_commit()
+
+    def record_metrics(self, generation: int, named: Mapping[str, float]) -> None:
+        """Store metrics of a generation that is stored, in one transaction. Raises StoreError if the database cannot be
+        written."""
+        with self._transaction("recording metrics") as connection:
+            metrics.record(connection, generation, named)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""

@@ -101,7 +101,7 @@ def test_its_runs_are_resumed_forked_verified_reported_and_exported(tmp_path, ca
     write_report(whole.folder, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "search.patience" in page
-    assert "Metric of the search." in page
+    assert "Metric of the search, of the task" in page
     write_comparison([whole.folder, fork.folder], tmp_path / "both.html", statistics=tmp_path / "both.json")
     assert "metric_restarts" in (tmp_path / "both.json").read_text()
     assert {file.name for file in export(whole, "npz", tmp_path / "export")} >= {"policies.npz"}

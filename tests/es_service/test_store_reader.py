@@ -116,7 +116,7 @@ def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("version", "message"),
     [
-        (9, r"schema version 9; .* versions up to 8\. Upgrade"),
+        (10, r"schema version 10; .* versions up to 9\. Upgrade"),
         (1, r"use version 0\.1 to read or continue it .* is 1, .* es-service supports 8"),
     ],
 )

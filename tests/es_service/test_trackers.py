@@ -84,9 +84,9 @@ def test_rows_that_are_committed_during_a_session_are_sent(folder, monkeypatch):
     whole = tracking.fill
     shown = [5, 12]
 
-    def fill_part(tracker, run, newest):
+    def fill_part(tracker, run, newest, *, has_ended):
         if not shown:
-            return whole(tracker, run, newest)
+            return whole(tracker, run, newest, has_ended=has_ended)
         last = shown.pop(0)
         tracker.log([row for row in run.history_rows(newest + 1) if row["generation"] <= last])
         return last

@@ -88,10 +88,11 @@ def test_a_run_goes_on_while_a_viewer_holds_it_and_a_killed_one_computes_again_w
             shutil.copytree(folder, killed, ignore=shutil.ignore_patterns("*-shm"))
         elif row["generation"] == 6:
             viewer.leave()
+        return {"at": row["generation"]}  # which waits, too
 
     api.run(api.load_config(CONFIG), folder, on_generation=on_generation, on_notice=notices.append)
     assert digest(folder) == digest(undisturbed)
-    assert list(open_run(folder).history.index) == list(range(9))
+    assert open_run(folder).history.metric_at.tolist() == list(range(9))
     assert [notice.partition(f"{folder / 'run.db'}")[0::2] for notice in notices] == [
         (
             "another program holds ",

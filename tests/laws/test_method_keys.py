@@ -144,6 +144,7 @@ NOT_MEASURED = {
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
     "task.descriptor": "is for tasks of Python objects; `test_gymnasium.py` has it",
     "task.success": "is for tasks of Python objects; `test_gymnasium.py` has it",
+    "task.metrics": "is for tasks of Python objects; `test_metrics.py` has it",
     "task.new_object_each_episode": "is for tasks of Python objects; `test_host.py` has it",
     "task.time_limit_s": "is for tasks of Python objects and functions; `test_host.py` and `test_functions.py` have it",
     "policy.memory": "needs XLA; `test_policy_kinds.py` has it",

@@ -115,6 +115,8 @@ class Environment:
     environments and for tasks of users, so that their runs keep their bits."""
     control_step: ControlStep | None = None
     """What a step is to C MuJoCo, with which `doctor` compares it; None if it has no model of MuJoCo."""
+    metrics: Callable[[Any], Any] | None = None
+    """Function from a state to the metrics [M] of an episode that ends in it; None if the task has none."""
 
 
 def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
@@ -188,6 +190,7 @@ def make_host_task(
         TaskError: the task does not exist or cannot be used.
     """
     from workers.environments.host_descriptors import with_descriptor
+    from workers.environments.host_metrics import with_metrics
     from workers.environments.host_task import with_choices
 
     kind, _, rest = name.partition(":")
@@ -195,7 +198,8 @@ def make_host_task(
         from workers.environments import gymnasium_task as module
     else:
         from workers.environments import python_task as module
-    return with_descriptor(with_choices(module.make(rest, options), choices), choices.descriptor, descriptor_size)
+    chosen = with_metrics(with_choices(module.make(rest, options), choices), choices)
+    return with_descriptor(chosen, choices.descriptor, descriptor_size)
 
 
 def settings_of_description(name: str, options: Mapping[str, OptionValue], choices: HostChoices) -> dict[str, Any]:
@@ -215,6 +219,7 @@ def choices_of(settings: Mapping[str, Any]) -> HostChoices:
         tuple(descriptor) if isinstance(descriptor, list) else descriptor,
         settings.get("success"),
         settings.get("new_objects", False),
+        tuple(settings.get("metrics", ())),
     )
 
 

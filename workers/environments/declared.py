@@ -13,6 +13,7 @@ from typing import Any
 
 from es_service.protocol.messages import Bounds, TaskKind, TaskSpec
 from es_service.protocol.options import Option, OptionValue
+from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.protocol.raised import why_not_imported
 from es_service.protocol.user_code import import_user_module, in_no_file
 from workers.environments import TaskError
@@ -85,8 +86,10 @@ def construct(task: Any, options: Mapping[str, OptionValue]) -> Any:
         ) from None
 
 
-OF_EVERY_CLASS = ("final_fitness", "options", "walls", "wall_clearance", "goal", "least_reward", "goal_distance",
-                  "success")  # fmt: skip
+KEPT_ATTRIBUTES = ("walls", "wall_clearance", "goal", "least_reward", "final_fitness", "metric_names")
+"""What a class of any kind may declare as attributes, which a constructor must not change, since a run takes them from
+the class."""
+OF_EVERY_CLASS = (*KEPT_ATTRIBUTES, "options", "goal_distance", "success", "metrics")
 """What a class of any kind may declare, as attributes or methods."""
 NEAR = 0.88
 """Similarity (of `difflib`) of names of which one is taken for a misspelling of the other: a letter of nine."""
@@ -112,7 +115,9 @@ def unknown_attributes(path: str, task: Any, known: Collection[str]) -> tuple[st
     own = [name for name in dir(task) if not name.startswith("_") and name not in known]
     meant = {name: near for name in own for near in get_close_matches(name.lower(), open_names, 1, NEAR)}
     meant |= {name: instead for name, instead in OF_GYMNASIUM.items() if name in own}
-    return tuple(
+    alone = callable(getattr(task, "metrics", None)) and not hasattr(task, "metric_names")
+    nameless = (f"{path}: metrics records nothing, since the class has no metric_names",) if alone else ()
+    return nameless + tuple(
         f"{path}: {name} has no effect, since a task declares nothing of this name; did you mean {instead}? (Begin the "
         "names of your own attributes with _, if this note is to be left out.)"
         for name, instead in meant.items()
@@ -151,6 +156,7 @@ def wrong_values(task: Any, names: Any, bounds: Any, sizes: tuple[str, ...]) -> 
         "least_reward": 0.0 if least is None else least,
     }
     wrong += [f"{name} = {x!r} is not a finite number" for name, x in numbers.items() if not are_finite((x,))]
+    wrong += wrong_metrics(task)
     return wrong + [f"{name} = {size} is not positive" for name in sizes if (size := getattr(task, name)) < 1]
 
 
@@ -181,7 +187,20 @@ def task_of_class(
         least_reward=getattr(task, "least_reward", None),
         success=_success_in_words(task),
         kind=kind,
+        metric_names=tuple(getattr(task, "metric_names", ())),
     )
+
+
+def wrong_metrics(task: Any) -> list[str]:
+    """Problems of what a class says of its metrics; a class without `metric_names` has none."""
+    names = getattr(task, "metric_names", ())
+    if hasattr(task, "metric_names") and not callable(getattr(task, "metrics", None)):
+        return ["metric_names needs a method metrics, which returns as many numbers"]
+    if not isinstance(names, tuple):
+        return [f"metric_names = {names!r} is not a tuple"]
+    if wrong := wrong_metric_names(names):
+        return [f"metric_names has {', '.join(wrong)}; each name must be different and of {METRIC_FORM}"]
+    return []
 
 
 def _success_in_words(task: Any) -> str:

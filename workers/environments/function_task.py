@@ -15,6 +15,8 @@ starts at `start`. A function may have these attributes, too:
   descriptor is the first two parameters;
 - `deterministic = True`: equal parameters have equal results, so that a search evaluates each once;
 - `least_fitness`: the fitness from which QD-scores are counted;
+- `metric_names`, a tuple of names: the function returns as many numbers at the end, as one tuple or list, (fitness,
+  metrics) or (fitness, descriptor, metrics). The run records them as columns `metric_NAME`; NaN is no number;
 - a docstring, whose first line `es-service` shows.
 
 If a function has an argument `seed`, it gets a whole number below 2^31 that belongs to the episode, for random numbers
@@ -35,6 +37,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import Bounds, FloatArray, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options
+from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.protocol.parameters import FREE, ParameterSpec
 from workers.environments import TaskError
 from workers.environments.declared import are_finite, clashes, construct, import_named, unknown_attributes, wrong_pairs
@@ -44,7 +47,7 @@ PREFIX = "function:"
 SHOWN = 2
 """Parameters that are the descriptor of a function without one."""
 DESCRIPTOR = ("descriptor_names", "descriptor_bounds")
-KNOWN = ("parameters", "start", *DESCRIPTOR, "deterministic", "least_fitness", "options")
+KNOWN = ("parameters", "start", *DESCRIPTOR, "deterministic", "least_fitness", "options", "metric_names")
 
 
 @dataclass(frozen=True)
@@ -57,29 +60,37 @@ class FunctionTask:
     has_descriptor: bool
     """Whether the function returns a descriptor; else it is the first parameters."""
     takes_seed: bool
+    metrics: int
+    """How many metrics the function returns."""
     call: Callable[..., Any]
 
-    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, NDArray[np.float32]]:
-        """(fitness, descriptor [B]) of search parameters.
+    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, NDArray[np.float32], NDArray[np.float32]]:
+        """(fitness, descriptor [B], metrics [M]) of search parameters.
 
         Raises whatever the function raises, and TaskError for a result of another form.
         """
         point_D = self.parameters.values(parameters_D)
         result = self.call(point_D.copy(), **({"seed": seed} if self.takes_seed else {}))
-        if not self.has_descriptor:
-            return _number(result, self.name), point_D[: self.descriptor_size].astype(np.float32)
-        if not (isinstance(result, tuple | list) and len(result) == 2):
+        sizes = {"descriptor": self.descriptor_size} if self.has_descriptor else {}
+        sizes |= {"metrics": self.metrics} if self.metrics else {}
+        if sizes and not (isinstance(result, tuple | list) and len(result) == 1 + len(sizes)):
             forgotten = "; is a `return` missing?" if result is None else ""
-            raise TaskError(f"{self.name} returned {result!r}; it must return (fitness, descriptor){forgotten}")
+            must = ", ".join(["fitness", *sizes])
+            raise TaskError(f"{self.name} returned {result!r}; it must return ({must}){forgotten}")
+        fitness, *others = result if sizes else (result,)
+        given = {what: self._numbers(what, value, sizes[what]) for what, value in zip(sizes, others, strict=True)}
+        first_B = point_D[: self.descriptor_size].astype(np.float32)
+        no_metrics = np.zeros(0, np.float32)
+        return _number(fitness, self.name), given.get("descriptor", first_B), given.get("metrics", no_metrics)
+
+    def _numbers(self, what: str, value: Any, size: int) -> NDArray[np.float32]:
         try:
-            descriptor_B = np.asarray(result[1], np.float32).reshape(-1)
+            array_N = np.asarray(value, np.float32).reshape(-1)
         except (TypeError, ValueError):
-            raise TaskError(f"{self.name} returned the descriptor {result[1]!r}; it must be numbers") from None
-        if descriptor_B.size != self.descriptor_size:
-            raise TaskError(
-                f"{self.name} returned a descriptor of size {descriptor_B.size}, not {self.descriptor_size}"
-            )
-        return _number(result[0], self.name), descriptor_B
+            raise TaskError(f"{self.name} returned the {what} {value!r}; it must be numbers") from None
+        if array_N.size != size:
+            raise TaskError(f"{self.name} returned {what} of size {array_N.size}, not {size}")
+        return array_N
 
 
 def describe(path: str) -> TaskSpec:
@@ -109,6 +120,9 @@ def describe(path: str) -> TaskSpec:
             )
         else:
             wrong += wrong_pairs("descriptor_bounds", bounds) + clashes(tuple(map(str, names)))
+    metrics = getattr(function, "metric_names", ())
+    if not isinstance(metrics, tuple) or wrong_metric_names(metrics):
+        wrong.append(f"metric_names = {metrics!r} is not a tuple of different names of {METRIC_FORM}")
     least = getattr(function, "least_fitness", None)
     if least is not None and not are_finite((least,)):
         wrong.append(f"least_fitness = {least!r} is not a finite number")
@@ -130,6 +144,7 @@ def describe(path: str) -> TaskSpec:
         parameters=parameters,
         deterministic=bool(getattr(function, "deterministic", False)),
         notes=unknown_attributes(name, function, KNOWN),
+        metric_names=metrics,
     )
 
 
@@ -145,6 +160,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> FunctionTask:
         parameters=parameters,
         descriptor_size=len(_descriptor(function, parameters)[0]),
         has_descriptor=hasattr(function, DESCRIPTOR[0]),
+        metrics=len(getattr(function, "metric_names", ())),
         takes_seed="seed" in inspect.signature(call).parameters,
         call=call,
     )

@@ -36,6 +36,7 @@ from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE
 from es_service.protocol.user_code import import_user_module
 from workers.environments import TaskError
 from workers.environments.host_descriptors import describe_descriptor
+from workers.environments.host_metrics import missing_metrics, with_metrics
 from workers.environments.host_task import (
     LENGTH,
     HostTask,
@@ -71,7 +72,7 @@ def describe(name: str, options: Mapping[str, OptionValue], choices: HostChoices
     Raises:
         TaskError: there is no such environment, it cannot be made, or its spaces are not supported.
     """
-    task, spec = with_choices(make(name, options), choices), _registered(name)
+    task, spec = with_metrics(with_choices(make(name, options), choices), choices), _registered(name)
     made = task.make()
     observations, actions = made.observation_space, made.action_space
     size = int(actions.n) if _is(actions, "Discrete") else int(np.prod(actions.shape))
@@ -98,8 +99,9 @@ def describe(name: str, options: Mapping[str, OptionValue], choices: HostChoices
         options=_options(made, spec, options),
         summary=f"{type(made.unwrapped).__name__} of Gymnasium",
         success=success,
-        notes=notes,
+        notes=(*notes, *missing_metrics(task, told)),
         kind="python",
+        metric_names=task.metric_names,
         discrete_actions=_is(actions, "Discrete"),
         action_bounds=() if _is(actions, "Discrete") else action_bounds(_pairs(actions), size),
     )

@@ -44,10 +44,17 @@ class HostEpisode:
     said: dict[str, Any] = field(default_factory=dict)
     """The newest value of every key that `info` has had in this episode."""
     steps: int = 0
+    counted: dict[str, list[Any]] = field(default_factory=dict)
+    """All values that the keys `HostTask.counted` of `info` have had in this episode."""
     observations: list[FloatArray] = field(default_factory=list)
     """All observations from the reset on, and"""
     rewards: list[float] = field(default_factory=list)
     """all rewards, if the descriptor is a function of the episode that the config names; else empty."""
+
+
+def no_metrics(episode: HostEpisode) -> tuple[()]:
+    """The metrics of a task without any."""
+    return ()
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,11 @@ class HostTask:
     """Whether `HostEpisode` has all observations and rewards."""
     new_objects: bool = False
     """Whether each episode has a new object, so that nothing is carried over from one to the next."""
+    metric_names: tuple[str, ...] = ()
+    metrics: Callable[[HostEpisode], Any] = no_metrics
+    """Function from an episode that ends now to its metrics [M]."""
+    counted: tuple[str, ...] = ()
+    """Keys of `info` of which `HostEpisode` has all values."""
 
 
 CONTRACTS = {
@@ -142,6 +154,9 @@ class HostEnvironment:
         episode.info = ends[2] if len(ends) == 3 else {}
         self._require_info("step", episode.info)
         episode.said |= episode.info
+        for key in self._task.counted:
+            if key in episode.info:
+                episode.counted.setdefault(key, []).append(self._number(key, episode.info[key]))
         if self._task.keeps_all:
             episode.observations.append(episode.observation_O)
             episode.rewards.append(reward)
@@ -180,6 +195,14 @@ class HostEnvironment:
         if (has_succeeded := _bool(value)) is None:
             raise TaskError(f"{self._task.name}: success is {_shown(value)}; it must be one bool")
         return has_succeeded
+
+    def metrics(self) -> FloatArray:
+        """Metrics [M] of the episode if it ends now."""
+        return self._numbers("the value of metrics", self._task.metrics(self._episode), len(self._task.metric_names))
+
+    def _number(self, key: str, value: Any) -> float:
+        """The value of a key of `info` that is a metric."""
+        return self._numbers(f"info[{key!r}], which task.metrics names,", value, 1).item()
 
     def _require_info(self, method: str, info: Any) -> None:
         if not isinstance(info, Mapping):
@@ -268,7 +291,7 @@ def try_out(task: HostTask, action_size: int) -> set[str]:
             if done:
                 environment.reset(seed)
             _, _, done = environment.step(copy(action))  # an object may change its array
-            for ask in (environment.descriptor, environment.goal_distance, environment.success):
+            for ask in (environment.descriptor, environment.goal_distance, environment.success, environment.metrics):
                 ask()
             keys |= {*environment.info}
     except TaskError:

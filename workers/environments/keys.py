@@ -45,6 +45,7 @@ def words_in_place_of_keys(environment: Environment) -> Environment:
         descriptor=lambda state: environment.descriptor(inside(state)),
         goal_distance=lambda state: environment.goal_distance(inside(state)),
         success=lambda state, before: environment.success(inside(state), before),
+        metrics=None if (metrics := environment.metrics) is None else lambda state: metrics(inside(state)),
         viewer=viewer and viewer._replace(poses=lambda state: viewer.poses(inside(state))),
     )
 

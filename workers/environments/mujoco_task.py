@@ -19,6 +19,7 @@ It may also have:
   or its `qpos0` and 0;
 - a second parameter of `reward` and `done`, `reward(self, data, earlier)`: the data before the control step;
 - `goal_distance(self, data)`, and `success(self, data, before)`, where `before` is the answer for the state before;
+- `metric_names` and `metrics(self, data)`, as many numbers of an episode that ends here, as in `user_task.py`;
 - `options`, `final_fitness`, `walls`, `wall_clearance`, `goal`, `least_reward` and a docstring, as in `user_task.py`;
   `model` may be a property that depends on options.
 
@@ -78,7 +79,7 @@ EARLIER = "earlier"
 """An argument that a function may do without."""
 ARGUMENTS = {
     **dict.fromkeys(("reward", "done"), ("data", EARLIER)),
-    **dict.fromkeys(("descriptor", "observe", "goal_distance"), ("data",)),
+    **dict.fromkeys(("descriptor", "observe", "goal_distance", "metrics"), ("data",)),
     "success": ("data", "before"),
     "reset": ("key",),
 }
@@ -99,6 +100,8 @@ class TaskState(NamedTuple):
     goal_distance: Any
     successes_2: Any
     """Whether an episode that ends here has succeeded, if it would not have, and if it would have, a step before."""
+    metrics_M: Any = None
+    """None if the class has no metrics."""
 
 
 def describe(path: str, task: Any, given: Mapping[str, OptionValue]) -> TaskSpec:
@@ -147,7 +150,9 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
         jnp.asarray(np.where(limited, bounds, side), jnp.float32)
         for bounds, side in zip(model.actuator_ctrlrange.T, (-1.0, 1.0), strict=True)
     )
-    wanted = {name: _wanted(own, name) for name in ARGUMENTS if hasattr(own, name)}
+    has_metrics = hasattr(own, "metric_names")
+    called = [name for name in ARGUMENTS if hasattr(own, name) and (name != "metrics" or has_metrics)]
+    wanted = {name: _wanted(own, name) for name in called}
     own_reset = reset_of(own) if hasattr(own, "reset") else lambda key: (first_qpos, first_qvel)
 
     def ctrl(action: Any) -> Any:
@@ -192,6 +197,7 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
             say("descriptor", (len(task.descriptor_names),), data).astype(jnp.float32),
             jnp.asarray(distance, jnp.float32),
             jnp.stack([succeeds(jnp.bool_(False)), succeeds(jnp.bool_(True))]),
+            say("metrics", (len(task.metric_names),), data).astype(jnp.float32) if has_metrics else None,
         )
 
     def reset(key: Any) -> TaskState:
@@ -220,6 +226,7 @@ def make(path: str, task: Any, options: Mapping[str, OptionValue]) -> Environmen
         lambda state: state.descriptor_B,
         lambda state: state.goal_distance,
         lambda state, before: jnp.where(before, state.successes_2[1], state.successes_2[0]),
+        metrics=(lambda state: state.metrics_M) if has_metrics else None,
         viewer=mujoco_viewer(model, mx, task.frame_skip * float(model.opt.timestep), lambda state: state.physics),
         control_step=ControlStep(model, task.frame_skip, lambda state: state.physics, ctrl),
     )

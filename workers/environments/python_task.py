@@ -18,6 +18,9 @@ Gymnasium return: (observation, info), and (observation, reward, terminated, tru
 - `discrete_actions = True`: `step` gets the number of one of `action_size` actions, which the policy chooses;
 - `goal_distance(self)` and `success(self)`, of an episode that ends now; without the latter, an episode succeeds if the
   `info` of its last step has a true `is_success`, where the first steps have one;
+- `metric_names`, a tuple of names, and `metrics(self)`, as many numbers of an episode that ends now, which the run
+  records as columns `metric_NAME` of its history (means over the evaluation episodes); NaN is no number. `task.metrics`
+  of a config adds values of `info` to them;
 - `final_fitness`, `options`, `walls`, `wall_clearance`, `goal`, `least_reward` and a docstring, as in
   `workers.environments.user_task`.
 
@@ -37,6 +40,7 @@ from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
 from workers.environments import TaskError
 from workers.environments.declared import (
+    KEPT_ATTRIBUTES,
     OF_EVERY_CLASS,
     are_finite,
     construct,
@@ -48,12 +52,14 @@ from workers.environments.declared import (
     wrong_values,
 )
 from workers.environments.host_descriptors import describe_descriptor
+from workers.environments.host_metrics import missing_metrics, with_metrics
 from workers.environments.host_task import (
     LENGTH,
     HostTask,
     action_bounds,
     chosen,
     length,
+    no_metrics,
     said_success,
     success_in_words,
     try_out,
@@ -66,9 +72,8 @@ SIZES = ("observation_size", "action_size", "episode_steps")
 METHODS = ("reset", "step")
 DESCRIPTOR = ("descriptor_names", "descriptor_bounds")
 KNOWN = (*SIZES, *METHODS, *DESCRIPTOR, *OF_EVERY_CLASS, "descriptor", "action_bounds", "discrete_actions")
-KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", "walls", "wall_clearance", "goal", "least_reward",
-        "final_fitness")  # fmt: skip
-"""Attributes that a constructor must not change, since a run takes them from the class."""
+KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", *KEPT_ATTRIBUTES)
+"""Attributes that a constructor must not change."""
 PREFIX = "python:"
 
 
@@ -107,13 +112,14 @@ def describe(
     if wrong:
         raise TaskError(f"{name}: {'; '.join(wrong)}")
     spec = task_of_class(name, task, "python", (names, bounds), options)
-    made = with_choices(make(path, option_values(options, given)), choices)
-    success, about_success = success_in_words(choices, try_out(made, task.action_size), spec.success)
+    made = with_metrics(with_choices(make(path, option_values(options, given)), choices), choices)
+    told = try_out(made, task.action_size)
+    success, about_success = success_in_words(choices, told, spec.success)
     if choices.descriptor is not None:
         no_bounds = [(-math.inf, math.inf)] * task.observation_size
         names, bounds = describe_descriptor(made, choices.descriptor, no_bounds, task.action_size)
         spec = replace(spec, descriptor_names=names, descriptor_bounds=bounds)
-    notes = (*unknown_attributes(name, task, KNOWN), *about_success)
+    notes = (*unknown_attributes(name, task, KNOWN), *about_success, *missing_metrics(made, told))
     limits = getattr(task, "action_bounds", None)
     return replace(
         spec,
@@ -121,6 +127,7 @@ def describe(
         action_bounds=() if limits is None else action_bounds(limits, task.action_size),
         success=success,
         notes=notes,
+        metric_names=made.metric_names,
     )
 
 
@@ -162,6 +169,8 @@ def make(path: str, options: Mapping[str, OptionValue]) -> HostTask:
         descriptor=(lambda episode: episode.environment.descriptor()) if has_descriptor else length,
         success=(lambda episode: episode.environment.success()) if hasattr(kind, "success") else said_success,
         goal_distance=(lambda episode: episode.environment.goal_distance()) if hasattr(kind, "goal_distance") else None,
+        metric_names=getattr(kind, "metric_names", ()),
+        metrics=(lambda episode: episode.environment.metrics()) if hasattr(kind, "metric_names") else no_metrics,
     )
 
 

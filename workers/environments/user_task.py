@@ -18,6 +18,9 @@ A class with a model of MuJoCo has less to say, see `mujoco_task.py`. It may als
 - `success(self, state, before)`: whether an episode that ends in this state has succeeded; `before` is the answer for
   the state before, False in the reset. `return before | (...)` is for a condition that need hold only once. Its
   docstring's first line says in words which episodes succeed;
+- `metric_names`, a tuple of names, and `metrics(self, state)`, as many numbers of an episode that ends in this state,
+  which the run records as columns `metric_NAME` of its history (means over the evaluation episodes). What is counted
+  along the way, such as energy or the greatest height, is part of the state; NaN is no number;
 - `final_fitness = True`, if the last reward measures the whole episode;
 - `options`, keyword arguments of the constructor, which must not change any size: by name, `("default", "other")` for a
   few allowed values, or a default with bounds, such as `Option(0.5, low=0.0)`; see `es_service/protocol/options.py`;
@@ -55,6 +58,7 @@ from es_service.protocol.options import OptionValue, declared_options, option_va
 from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError
 from workers.environments.declared import (
+    KEPT_ATTRIBUTES,
     OF_EVERY_CLASS,
     construct,
     import_named,
@@ -167,6 +171,8 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
             "goal_distance": (_shape("goal_distance", environment.goal_distance, state), ()),
             "success": (_shape("success", environment.success, state, jax.ShapeDtypeStruct((), bool)), ()),
         }
+        if environment.metrics is not None:
+            shapes["metrics"] = (_shape("metrics", environment.metrics, state), (len(task.metric_names),))
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in shapes.items() if is_ != should]
     arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state, after)]
     if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
@@ -198,7 +204,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
 
         return mujoco_task.make(path, kind, options)
     task = construct(kind, options)
-    for name in (*ATTRIBUTES, "walls", "wall_clearance", "goal", "least_reward", "final_fitness"):
+    for name in (*ATTRIBUTES, *KEPT_ATTRIBUTES):
         of_class, of_instance = getattr(kind, name, None), getattr(task, name, None)
         if repr(of_class) != repr(of_instance):
             raise TaskError(
@@ -226,7 +232,16 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     viewer = task.viewer() if hasattr(task, "viewer") else None
     success = getattr(task, "success", lambda state, before: before)
     return words_in_place_of_keys(
-        Environment(reset_of(task), observe, step, task.descriptor, goal_distance, success, viewer=viewer)
+        Environment(
+            reset_of(task),
+            observe,
+            step,
+            task.descriptor,
+            goal_distance,
+            success,
+            metrics=task.metrics if hasattr(task, "metric_names") else None,
+            viewer=viewer,
+        )
     )
 
 

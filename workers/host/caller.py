@@ -55,8 +55,9 @@ class Caller:
             self.close()
             raise
 
-    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
-        """(fitness, descriptor [B]). Raises CallFailedError if the call raised, ended its process, or took too long."""
+    def __call__(self, parameters_D: FloatArray, seed: int) -> tuple[float, Any, Any]:
+        """(fitness, descriptor [B], metrics [M]). Raises CallFailedError if the call raised, ended its process, or took
+        too long."""
         self.start()
         return self._answer((parameters_D, seed), self._limit_s, " (task.time_limit_s)")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
-from es_service.protocol.outputs import AT_THE_END, OF_STEPS
+from es_service.protocol.outputs import AT_THE_END, METRICS, OF_STEPS
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
 from workers.host.policies import LanePolicies
@@ -58,6 +58,9 @@ def _observation(spec: WorkerSpec, task: HostTask) -> tuple[int, ...]:
 OUTPUTS: Mapping[str, HostOutput] = {
     "success": HostOutput(_scalar, bool, lambda step: step.environment.success()),
     "last_reward": HostOutput(_scalar, np.float32, lambda step: step.reward),
+    METRICS: HostOutput(
+        lambda spec, task: (len(task.metric_names),), np.float32, lambda step: step.environment.metrics()
+    ),
     "first_observation": HostOutput(_observation, np.float32, lambda step: step.environment.first_observation_O),
     "last_observation": HostOutput(_observation, np.float32, lambda step: step.observation_O),
     "observation": HostOutput(_observation, np.float32, lambda step: step.before_O),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import FloatArray, WorkerSpec
+from es_service.protocol.outputs import METRICS
 from es_service.protocol.raised import raised
 from workers import progress
 from workers.environments.function_task import FunctionTask
@@ -25,11 +26,13 @@ LONGEST = 1000
 """Longest reason of a failure there, in characters."""
 POINTS = 2
 """Points of a trace, of an episode with one step."""
+Call = Callable[[FloatArray, int], tuple[float, Any, Any]]
+"""Function (parameters [D], seed) -> (fitness, descriptor [B], metrics [M])."""
 
 
 def run_calls(
     task: FunctionTask,
-    called: Callable[[FloatArray, int], tuple[float, Any]],
+    called: Call,
     spec: WorkerSpec,
     parameters_L_D: FloatArray,
     mean: FloatArray,
@@ -54,11 +57,12 @@ def run_calls(
     lanes, failures = len(reset_keys_L_4), []
     fitness_L = np.zeros(lanes, np.float32)
     descriptor_L_B = np.zeros((lanes, task.descriptor_size), np.float32)
+    metrics_L_M = np.zeros((lanes, task.metrics), np.float32)
     for lane in range(lanes):
         if runs_L is None or runs_L[lane]:
             seed = seed_of(reset_keys_L_4[lane])
             result = _called(task, called, parameters_L_D[lane], seed, allow_infeasible=spec.allow_infeasible)
-            fitness_L[lane], descriptor_L_B[lane], why = result
+            fitness_L[lane], descriptor_L_B[lane], metrics_L_M[lane], why = result
             progress.moved()
             if why:
                 named = task.parameters.text(parameters_L_D[lane])
@@ -80,7 +84,7 @@ def run_calls(
         shifted_sum_O=sums_L_O,
         shifted_square_sum_O=sums_L_O,
         trace_T_B=np.repeat(descriptor_L_B[:, None], points, axis=1),
-        outputs={name: _output(name, fitness_L) for name in spec.outputs},
+        outputs={name: _output(name, fitness_L, metrics_L_M) for name in spec.outputs},
         of_steps={},
         failures=tuple(failures),
     )
@@ -88,19 +92,19 @@ def run_calls(
 
 def _called(
     task: FunctionTask,
-    called: Callable[[FloatArray, int], tuple[float, Any]],
+    called: Call,
     parameters_D: FloatArray,
     seed: int,
     *,
     allow_infeasible: bool = False,
-) -> tuple[float, Any, str]:
-    """(fitness, descriptor, empty text) of a call; if it fails, NaN and the reason."""
+) -> tuple[float, Any, Any, str]:
+    """(fitness, descriptor, metrics, empty text) of a call; if it fails, NaN and the reason."""
     try:
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and invalid
-            fitness, descriptor_B = called(parameters_D, seed)
+            fitness, descriptor_B, metrics_M = called(parameters_D, seed)
             is_finite, is_place = np.isfinite(np.float32(fitness)), np.isfinite(descriptor_B).all()
             if (is_finite and is_place) or (allow_infeasible and fitness == -np.inf):
-                return fitness, descriptor_B, ""
+                return fitness, descriptor_B, metrics_M, ""
         wrong = [] if is_finite else [f"the fitness {fitness:g} is no finite number that float32 holds"]
         wrong += (
             [] if is_place else [f"the descriptor {descriptor_B.tolist()} has numbers that are not finite in float32"]
@@ -110,11 +114,14 @@ def _called(
         why = str(error)
     except (Exception, SystemExit) as error:  # the user's code can raise anything
         why = raised(error, task.name).message
-    return np.nan, np.full(task.descriptor_size, np.nan, np.float32), why
+    no_descriptor, no_metrics = (np.full(size, np.nan, np.float32) for size in (task.descriptor_size, task.metrics))
+    return np.nan, no_descriptor, no_metrics, why
 
 
-def _output(name: str, fitness_L: FloatArray) -> Any:
+def _output(name: str, fitness_L: FloatArray, metrics_L_M: FloatArray) -> Any:
     """The outputs of a call that `protocol.outputs` names."""
     if name == "last_reward":
         return fitness_L
+    if name == METRICS:
+        return metrics_L_M
     raise ValueError(f"a function has no output {name!r}, since it has no policy and no steps")
