@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parents[1]
 CLONE = PACKAGE.parent
 GUIDES = {
     "using": (PACKAGE / "guides" / "using.md",),
+    "tutorial": (PACKAGE / "guides" / "tutorial.md",),
     "certify": (PACKAGE / "guides" / "certify.md",),
     **{
         name: tuple(folder / f"{file}.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs"))

@@ -7,7 +7,7 @@ import math
 import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -88,15 +88,16 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
     """All policies of a run after one generation, with their observation statistics: the best centre, the newest
-    centre (none if the generation evaluated only policies, as those of map_elites do) and every elite of the map.
+    centre (none if the generation evaluated only policies, as those of map_elites do) and every elite of the map; and
+    the certified policy, if there is one.
 
     Names: `widths` of the layers, `activation`, `output`, `bias` and `memory` (0: none) as in the config,
-    `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
-    [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
-    `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters` [N, D],
-    `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer
-    after layer; those of a memory are of its gates and its candidate (`workers/policies/policy.py`). If the task is
-    a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
+    `observation_clip` (NaN: none); for the best, the newest and the certified one `best_parameters` [D], `best_mean`
+    [O], `best_std` [O], `centre_parameters`, ..., `certified_parameters`, ...; for N elites `cell` [N, dimensions of
+    the map], `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters`
+    [N, D], `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases,
+    layer after layer; those of a memory are of its gates and its candidate (`workers/policies/policy.py`). If the task
+    is a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
     snapshot = run.at(named=named_by_all)
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
@@ -108,9 +109,12 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         "memory": np.array(spec.memory),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
-    stored: list[Literal["best", "centre"]] = ["best"] if snapshot.newest_centre is None else ["best", "centre"]
-    for which in stored:
-        policy = snapshot.policy(which)
+    policies = {"best": snapshot.policy("best")}
+    if snapshot.newest_centre is not None:
+        policies["centre"] = snapshot.policy("centre")
+    if newest_certified(run.folder) is not None:
+        policies["certified"] = run.policy("certified")
+    for which, policy in policies.items():
         exported |= {
             f"{which}_parameters": policy.parameters_D,
             f"{which}_mean": policy.observation_mean_O,

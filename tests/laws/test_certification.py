@@ -25,6 +25,7 @@ from es_service.runs import certification
 from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, outputs_of
 from es_service.runs.certified import certified_policies
 from es_service.runs.evaluation import FRESH_GENERATION
+from es_service.runs.export import arrays
 from es_service.runs.selection import mean_interval, share_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
@@ -296,6 +297,8 @@ def test_the_command_line_certifies_and_shows_it(finished, tmp_path):
     exported = CliRunner().invoke(app, ["export", str(folder), "--to", "csv", "--out", str(tmp_path / "out")])
     assert exported.exit_code == 0, exported.output
     assert len((tmp_path / "out" / "certified.csv").read_text().splitlines()) == 1 + 5
+    certified = es_service.open_run(folder).policy("certified")
+    np.testing.assert_array_equal(arrays(es_service.open_run(folder))["certified_parameters"], certified.parameters_D)
 
 
 @pytest.mark.parametrize(

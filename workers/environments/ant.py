@@ -81,8 +81,8 @@ class Ant(NamedTuple):
 
 
 def ant_in(physics: str, walls: tuple[Segment, ...]) -> Ant:
-    """The ant of a task in the physics that its option names: `spring`, `mujoco` with the integrator RK4 of `ant.xml`, or
-    `mujoco_euler`, which takes a quarter of the time.
+    """The ant of a task in the physics that its option names: `spring`, `mujoco` with the integrator RK4 of `ant.xml`,
+    or `mujoco_euler`, which takes a quarter of the time.
 
     Raises:
         TaskError: what the physics needs is not installed.
