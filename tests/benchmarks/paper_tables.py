@@ -128,9 +128,10 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
         )
         lines += ["", f"Not finished: {which}."]
     values = {name: row[list(TASKS).index(task)] for name, row in PAPER.items()}
-    beside = [f"{name} {value}" + _to_goal(name, with_goal) for name, value in values.items() if value]
+    beside = {name: value + _to_goal(name, with_goal) for name, value in values.items() if value}
     physics = ", with other physics of the ant" if task.startswith("ant_") else ""
-    lines += ["", f"In the paper{physics}, after {power(paper_steps)} unless said: {', '.join(beside)}.", ""]
+    lines += ["", f"In the paper{physics}, after {power(paper_steps)} unless said:", "", _line([*beside])]
+    lines += [_line(["---"] * len(beside)), _line([*beside.values()]), ""]
     return "\n".join(lines)
 
 

@@ -108,7 +108,8 @@ def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_w
     assert "| ARS | 0 | **900** | **900**" in text
     assert "| **700** (650 to 750, 2 runs) |" in text
     assert "Not finished: MEMES seed 2 (40 M)." in text
-    assert "In the paper, with other physics of the ant, after 1e8 unless said: QD-PG 1540 ± 46" in text
+    assert "In the paper, with other physics of the ant, after 1e8 unless said:\n\n| QD-PG | SAC |" in text
+    assert "| 1540 ± 46 | 1075 ± 7 |" in text
     assert "1e7" not in text
 
 
