@@ -308,6 +308,12 @@ def test_a_reset_that_takes_its_key_for_one_of_jax_is_told_how_to_make_one():
         (f"{HERE}:still", rf"has no class still; did you mean {HERE}:Still\?"),
         ("function:tests.examples.beam:baem", r"has no function baem; did you mean tests.examples.beam:beam\?"),
         (f"{HERE}:Zqx", "has no class Zqx$"),
+        (
+            "tests.examples.beam:beam",
+            r"beam is a function and no class; did you mean function:tests.examples.beam:beam\?$",
+        ),
+        ("python:tests.examples.beam:beam", r"no class; did you mean function:tests.examples.beam:beam\?$"),
+        (f"function:{HERE}:Plain", rf"its objects are no functions; did you mean python:{HERE}:Plain\?$"),
         (f"{HERE}:Plain", rf"has no .*observe, .*; if it simulates in Python, did you mean python:{HERE}:Plain\?"),
     ],
 )

@@ -126,6 +126,8 @@ def unknown_attributes(path: str, task: Any, known: Collection[str]) -> tuple[st
 
 def missing_names(task: Any, needed: Collection[str], help_text: str) -> str:
     """What a class lacks, in words: " has no X; HELP" with the attributes that may be meant; empty if nothing."""
+    if inspect.isfunction(task):
+        return f" is a function and no class; did you mean function:{task.__module__}:{task.__qualname__}?"
     missing = [name for name in needed if not hasattr(task, name)]
     own = {name.lower(): name for name in dir(task) if not name.startswith("_")}
     near = [own[other] for name in missing for other in get_close_matches(name, own.keys() - {*needed}, 1, NEAR)]

@@ -103,7 +103,8 @@ def describe(path: str) -> TaskSpec:
     if not callable(function):
         raise TaskError(f"{name} is no function, but {function!r}")
     if inspect.isclass(function) and not any("__call__" in vars(base) for base in function.__mro__):
-        raise TaskError(f"{name} is a class without __call__, so its objects are no functions")
+        hint = f"; did you mean python:{path}?" if hasattr(function, "step") else ""
+        raise TaskError(f"{name} is a class without __call__, so its objects are no functions{hint}")
     if not hasattr(function, "parameters"):
         raise TaskError(
             f"{name} has no attribute parameters; workers/environments/function_task.py lists what a function may have"
