@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -17,8 +18,9 @@ import pytest
 from es_service.dispatch.events import Limits
 from es_service.errors import Interrupted
 from es_service.loop.arrays import MAP, joined, value_of
-from es_service.loop.contents import elite_of
+from es_service.loop.contents import stored_elite
 from es_service.loop.history import NO_INTEGER
+from es_service.protocol.content import Policy
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -61,6 +63,12 @@ def chunk_runner(worker_spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResu
     """A worker that runs one chunk at a time."""
     run = make_worker(worker_spec)
     return lambda centre, chunk: run([(centre, chunk)])[0]
+
+
+def policy_with(parameters_D: np.ndarray) -> Policy:
+    """A policy with these parameters, for those who look at nothing else."""
+    nothing = np.zeros(0, np.float32)
+    return Policy(PolicySpec((1, 1)), parameters_D, nothing, nothing)
 
 
 class AtTheEnd:
@@ -181,7 +189,8 @@ class MemoryStore:
         """The elite of a filled cell, as it is stored, in the newest state or in that of some parts."""
         map_ = map_of(self.parts if parts is None else parts)
         row = map_.row_of(cell)
-        return elite_of(*(self.contents[names[row].tobytes()] for names in (map_.policy_N, map_.trace_N)))
+        policy, trace = (self.contents[names[row].tobytes()] for names in (map_.policy_N, map_.trace_N))
+        return stored_elite(PolicySpec(**json.loads(policy["spec"].tobytes())), policy, trace)
 
     def newest_history(self, count: int) -> list[dict]:
         return self.rows[-count:]

@@ -12,7 +12,7 @@ from es_service.config.workload import policy_spec
 from es_service.loop.arrays import stored
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.loop.state import Best, RunState
-from es_service.protocol.content import NAME, name_of, names, policy_content
+from es_service.protocol.content import NAME, Policy, name_of, names
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Moments, TaskSpec
 from es_service.search.algorithms import OURS
@@ -71,7 +71,7 @@ def write_run(
     rows[-1]["invalid_members"] = invalid
     centre_D = rng.normal(size=shape.parameters).astype(np.float32)
     size = task.observation_size
-    policy = policy_content(shape, centre_D, np.zeros(size, np.float32), np.ones(size, np.float32))
+    policy = Policy(shape, centre_D, np.zeros(size, np.float32), np.ones(size, np.float32)).content
     traces = [] if map_ is None else [{"trace_T_B": _path(end_B, rng)} for end_B in map_.descriptor_N_B]
     if map_ is not None:
         named = {"policy_N": names([name_of(policy)] * map_.size), "trace_N": names(map(name_of, traces))}

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from es_service.errors import EvaluationError, StoreError
 from es_service.loop.policies import PolicyWork
-from es_service.protocol.content import NAME, Arrays, Cache, as_bytes, name_of, names, policy_content
+from es_service.protocol.content import NAME, Arrays, Cache, Policy, as_bytes, name_of, names, policy_of
 from es_service.protocol.messages import Centre
 from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import Origin, Recipes, unvaried
 from es_service.search.algorithms.base import PolicyAsk
 from es_service.search.arrays import freeze
-from es_service.search.maps.behaviour_map import NO_TRACE, Elite
+from es_service.search.maps.behaviour_map import Elite
 
 RECENT_BYTES = 256 * 2**20
 """Most bytes that are kept of policies that the store has: 400 of an ant with a 256x256 policy are 155 MB."""
@@ -46,23 +46,25 @@ class Named:
     def names(self, rows: Sequence[int]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Names of the policies of some rows, and of their traces."""
         new = [row for row in dict.fromkeys(rows) if row not in self._known]
-        for row, point in self.points(new).items():
-            statistics = point.observation_mean_O, point.observation_std_O
+        for row, policy in self.policies(new).items():
             assert self._trace_N_T_B is not None, "an evaluation has a trace"
-            policy = policy_content(self._spec, point.parameters_D, *statistics)
-            self._known[row] = self._add(policy), self._add({"trace_T_B": self._trace_N_T_B[row].copy()})
+            self._known[row] = self._add(policy.content), self._add({"trace_T_B": self._trace_N_T_B[row].copy()})
         for work, numbers, rows_here in self._of_subjects(new):
             if isinstance(work, PolicyWork) and isinstance(work.parameters_N_D, Recipes):
                 self.origins |= work.parameters_N_D.part(numbers).origins_of([self._known[row][0] for row in rows_here])
         return names(self._known[row][0] for row in rows), names(self._known[row][1] for row in rows)
 
-    def points(self, rows: Sequence[int]) -> dict[int, Centre]:
-        """What was evaluated, by row, with its observation statistics, in arrays that are not parts of others."""
-        points: dict[int, Centre] = {}
+    def policies(self, rows: Sequence[int]) -> dict[int, Policy]:
+        """What was evaluated, by row, in arrays that are not parts of others."""
+        found: dict[int, Policy] = {}
         for subject, numbers, here in self._of_subjects(rows):
-            policies = [subject] if isinstance(subject, Centre) else subject.policies(numbers)
-            points |= zip(here, policies, strict=True)
-        return points
+            if isinstance(subject, Centre):
+                of = subject.parameters_D, subject.observation_mean_O, subject.observation_std_O
+                policies = [Policy(self._spec, *of)]
+            else:
+                policies = subject.policies(numbers, self._spec)
+            found |= zip(here, policies, strict=True)
+        return found
 
     def _of_subjects(self, rows: Sequence[int]) -> Iterator[tuple[Centre | PolicyWork, list[int], list[int]]]:
         """(a centre or an ask for policies, numbers of its policies, their rows), of those that have some of `rows`."""
@@ -123,9 +125,9 @@ class Contents:
             found[name] = content
         return found
 
-    def elite(self, name: bytes) -> Elite:
-        """A policy by its name, without a trace."""
-        return elite_of(self.of([name])[name])
+    def policy(self, name: bytes, spec: PolicySpec) -> Policy:
+        """A policy by its name; `spec`: what it is."""
+        return stored_policy(spec, self.of([name])[name])
 
     def completed(self, asked: object, generation: int) -> object:
         """What a search asks for, with the parameters of the policies that it names.
@@ -160,9 +162,17 @@ class Contents:
         return PolicyAsk(unvaried(policies).complete(known, self._origins), *statistics)
 
 
-def elite_of(content: Arrays, trace: Arrays | None = None) -> Elite:
-    """An elite of a policy as it is stored, and of a trace. Raises StoreError if they are something else."""
-    if "parameters_D" not in content or (trace is not None and "trace_T_B" not in trace):
-        raise StoreError("a name in the state is not that of a policy, or of a trace")
-    mean_O, std_O = content["observation_mean_O"], content["observation_std_O"]
-    return Elite(content["parameters_D"], mean_O, std_O, NO_TRACE if trace is None else trace["trace_T_B"])
+def stored_policy(spec: PolicySpec, content: Arrays) -> Policy:
+    """The policy of a content that a state names as one. Raises StoreError if it is something else."""
+    try:
+        return policy_of(spec, content)
+    except KeyError as error:
+        raise StoreError("a name in the state is not that of a policy") from error
+
+
+def stored_elite(spec: PolicySpec, content: Arrays, trace: Arrays) -> Elite:
+    """The elite of a policy as it is stored, and of a trace. Raises StoreError if they are something else."""
+    policy = stored_policy(spec, content)
+    if "trace_T_B" not in trace:
+        raise StoreError("a name in the state is not that of a trace")
+    return Elite(**vars(policy), trace_T_B=trace["trace_T_B"])

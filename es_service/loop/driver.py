@@ -229,10 +229,10 @@ def propose(
     """What the next generation asks for: (the state in which centres have restarted from elites, the cells of these
     elites by index of the centre, the asks)."""
     algorithm, begun, number = search.algorithm, state.search, state.generation + 1
-    size = begun.centres[0].centre_D.size
+    spec, size = policy_spec(search.config, search.task), begun.centres[0].centre_D.size
     start_cells = require_start_cells(algorithm.start_cells(begun, number), begun, number)
     for index, cell in start_cells.items():
-        begun = algorithm.restart(begun, index, cell, policies.elite(_policy_of(begun, cell)))
+        begun = algorithm.restart(begun, index, cell, policies.policy(_policy_of(begun, cell), spec))
         require_state(begun, "restart", number, index, size)
     asked: Any = policies.completed(algorithm.ask(begun, number), number)
     require_asks(asked, begun, search.config.compute.chunk_pairs, search.task.observation_size, number)

@@ -161,7 +161,7 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
         "archive_size": state.search.archive.size,
         **of_map,
         "update_norm": or_none(told.columns["update_norm"][at]),
-        "parameter_norm": norm(finished.named.points([at])[at].parameters_D),
+        "parameter_norm": norm(finished.named.policies([at])[at].parameters_D),
         **population_columns(finished.members.results, infeasible),
         **({"infeasible_members": infeasible} if search.config.search.allow_infeasible else {}),
         **evaluation_columns(table, results_in(told), at, search.task),

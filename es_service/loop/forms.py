@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from es_service.loop.arrays import ARCHIVE, BEST, BLOCK, CENTRES, COUNTS, EXTRA, GEOMETRY, MAP, OBSERVATIONS, WEIGHT
+from es_service.protocol.content import OF_POLICY
 
 INTEGER, REAL, BOOL, NAMES = "iu", "f", "b", "V"
 """Kinds of a `dtype`."""
@@ -40,7 +41,7 @@ _MORE = {
     CENTRES: {"own_mean_O": REAL, "own_std_O": REAL},
 }
 """The same for arrays that it may have; a step has any others, such as those of a user's search."""
-POLICY: Mapping[str, str] = {"parameters_D": REAL, "observation_mean_O": REAL, "observation_std_O": REAL}
+POLICY: Mapping[str, str] = dict.fromkeys(OF_POLICY, REAL)
 """Kinds of the arrays of a policy."""
 _ALWAYS = (COUNTS, OBSERVATIONS, WEIGHT, BEST, ARCHIVE, f"{CENTRES}/0")
 _ANY = "biuf"

@@ -10,9 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
+from es_service.protocol.content import Policy
+from es_service.protocol.messages import EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
+from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import Recipes
 
 
@@ -34,12 +36,11 @@ class PolicyWork:
         """Numbers of the policies and of the episodes of each."""
         return len(self.parameters_N_D), self.episodes
 
-    def policies(self, numbers: Sequence[int]) -> list[Centre]:
-        """Some of the policies, each as a centre without a population, in arrays that are not parts of others."""
-        generation = self.work[0][1].generation
+    def policies(self, numbers: Sequence[int], spec: PolicySpec) -> list[Policy]:
+        """Some of the policies, in arrays that are not parts of others; `spec`: what they are."""
         statistics = self.observation_mean_N_O, self.observation_std_N_O
         return [
-            Centre(generation, parameters_D, 0.0, *(array[number].copy() for array in statistics))
+            Policy(spec, parameters_D, *(array[number].copy() for array in statistics))
             for number, parameters_D in zip(numbers, self._parameters(numbers), strict=True)
         ]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -58,17 +58,38 @@ def as_bytes(name_N: NDArray[Any]) -> list[bytes]:
     return [flat[first : first + NAME.itemsize] for first in range(0, len(flat), NAME.itemsize)]
 
 
-def policy_content(
-    spec: PolicySpec, parameters_D: NDArray[np.float32], mean_O: NDArray[np.float32], std_O: NDArray[np.float32]
-) -> dict[str, NDArray[Any]]:
-    """A policy as it is stored, and named: its parameters, its observation statistics, and what it is."""
-    text = json.dumps(asdict(spec), sort_keys=True).encode()
-    return {
-        "parameters_D": parameters_D,
-        "observation_mean_O": mean_O,
-        "observation_std_O": std_O,
-        "spec": np.frombuffer(text, np.uint8),
-    }
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A policy with the observation statistics that it runs with: one form, from the map of a search to an export.
+
+    Axes: D policy parameters, O observation.
+    """
+
+    spec: PolicySpec
+    """What its network is."""
+    parameters_D: NDArray[np.float32] = field(repr=False)
+    observation_mean_O: NDArray[np.float32] = field(repr=False)
+    observation_std_O: NDArray[np.float32] = field(repr=False)
+
+    @property
+    def content(self) -> dict[str, NDArray[Any]]:
+        """Its arrays as they are stored, and named."""
+        text = json.dumps(asdict(self.spec), sort_keys=True).encode()
+        return {name: getattr(self, name) for name in OF_POLICY} | {"spec": np.frombuffer(text, np.uint8)}
+
+    @property
+    def name(self) -> bytes:
+        """Its name; two policies are the same if their names are equal."""
+        return name_of(self.content)
+
+
+OF_POLICY = ("parameters_D", "observation_mean_O", "observation_std_O")
+"""Arrays of a policy; a content that has them is one."""
+
+
+def policy_of(spec: PolicySpec, content: Arrays) -> Policy:
+    """The policy of a content. Raises KeyError if it is none."""
+    return Policy(spec, *(content[name] for name in OF_POLICY))
 
 
 class Cache(dict[Key, Value]):

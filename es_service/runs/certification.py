@@ -24,7 +24,9 @@ from numpy.typing import ArrayLike
 from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
+from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
+from es_service.protocol.content import Policy
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
@@ -41,7 +43,7 @@ from es_service.runs.evaluation import Candidate, candidates, evaluation_config
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import code_of
 from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
-from es_service.runs.selection import MEASURES, Measure, Parameters, halved, kept, results_of
+from es_service.runs.selection import MEASURES, Measure, halved, kept, results_of
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
@@ -59,7 +61,7 @@ class Named:
     """A candidate."""
 
     name: str
-    policy: Parameters
+    policy: Policy
     generation: int | None = None
     stored_fitness: float | None = None
 
@@ -143,8 +145,8 @@ def add_certified(
     row = store.last_history() if generation is None else next(iter(read_history(store.folder, generation, 1)), None)
     env_steps = None if row is None else int(row["env_steps"])
     certified = [replace(policy, env_steps=env_steps) for policy in certified]
-    rows = [stored(policy) for policy in certified]
-    when_free(partial(store.add_certification, rows), telling_once(store.folder, on_notice))
+    rows, contents = [stored(one) for one in certified], {one.policy.name: one.policy.content for one in certified}
+    when_free(partial(store.add_certification, rows, contents), telling_once(store.folder, on_notice))
     return certified
 
 
@@ -206,7 +208,8 @@ def certify(
     task = task_of(config)
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
-    given = [Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
+    spec, each = policy_spec(config, task), zip(policies_N_D, *statistics, strict=True)
+    given = [Named(str(index), Policy(spec, *arrays)) for index, arrays in enumerate(each)]
     return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by, on_output)
 
 
@@ -257,7 +260,7 @@ def _certify(
                 0,
                 platform,
                 kept(result),
-                *candidate.policy,
+                candidate.policy,
                 elsewhere[rank],
             )
         )
@@ -272,15 +275,10 @@ def platform_of(config: RunConfig, other: OtherTask | None = None) -> dict[str, 
 
 def different(chosen: Sequence[Candidate]) -> list[Named]:
     """The candidates; of equal policies only the first, since the best centre is often an elite as well."""
-    found: dict[tuple[bytes, ...], Named] = {}
+    found: dict[bytes, Named] = {}
     for candidate in chosen:
-        policy = (
-            candidate.policy.parameters_D,
-            candidate.policy.observation_mean_O,
-            candidate.policy.observation_std_O,
-        )
-        key = tuple(array.tobytes() for array in policy)
-        found.setdefault(key, Named(candidate.name, policy, candidate.generation, candidate.stored_fitness))
+        named = Named(candidate.name, candidate.policy, candidate.generation, candidate.stored_fitness)
+        found.setdefault(candidate.policy.name, named)
     return list(found.values())
 
 

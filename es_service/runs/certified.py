@@ -18,8 +18,8 @@ from pydantic import create_model
 
 from es_service.config.text import show
 from es_service.errors import StoreError
-from es_service.loop.forms import BOOL, INTEGER, REAL, Sizes, array_problem
-from es_service.protocol.messages import FloatArray
+from es_service.loop.forms import BOOL, INTEGER, POLICY, REAL, array_problem
+from es_service.protocol.content import OF_POLICY, Policy, names, policy_of
 from es_service.protocol.noise import Domain, seed_for
 from es_service.runs.selection import (
     Episodes,
@@ -29,10 +29,11 @@ from es_service.runs.selection import (
     interval_columns,
     share_gap_interval,
 )
-from es_service.runs.strangers import sizes_of
+from es_service.runs.strangers import policy_spec, sizes_of
 from es_service.store.certifications import CertifiedRow
 from es_service.store.facts import Damaged, Form, require_form
 from es_service.store.reader import read_certifications, read_meta
+from es_service.store.schema import RunMeta
 
 EPISODES = 256
 """Certification episodes of a policy, unless a call says otherwise; and the episodes of a decision."""
@@ -110,19 +111,12 @@ class Certified:
     platform: Mapping[str, Any]
     """Packages, processor and code that computed it; see `runs.identity.changes_since`."""
     episodes: Episodes
-    parameters_D: FloatArray
-    observation_mean_O: FloatArray
-    observation_std_O: FloatArray
+    policy: Policy
     elsewhere: Elsewhere | None = None
     """The same policy in another task; None if it was not asked for."""
     env_steps: int | None = None
     """Environment steps of the run at the generation from which the candidates were taken; None if it is not known: in
     runs of versions before 0.27, and for other policies."""
-
-    @property
-    def policy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Its parameters, and mean and standard deviation of its observations."""
-        return self.parameters_D, self.observation_mean_O, self.observation_std_O
 
     @property
     def title(self) -> str:
@@ -182,8 +176,8 @@ def all_certifications(folder: Path) -> list[Certified]:
     """All certified policies and all decisions of a run, in the order of certification and rank. Raises StoreError if
     one is damaged."""
     rows = read_certifications(folder)
-    sizes = sizes_of(read_meta(folder))
-    return [_from_row(folder, row, sizes) for row in rows]
+    meta = read_meta(folder)
+    return [_from_row(folder, row, meta) for row in rows]
 
 
 def certified_policies(folder: Path) -> list[Certified]:
@@ -202,15 +196,15 @@ def newest_certified(folder: Path) -> Certified | None:
     it. No older certification is read. Raises StoreError if it is damaged."""
     rows = read_certifications(folder, newest=lambda facts: not facts.get("decides"))
     first = next((row for row in rows if row.rank == 0), None)
-    return None if first is None else _from_row(folder, first, sizes_of(read_meta(folder)))
+    return None if first is None else _from_row(folder, first, read_meta(folder))
 
 
 def certified_elsewhere(folder: Path) -> dict[str, Certified]:
     """Title of another task -> the policy that the newest certification in it has put first. Raises StoreError if a
     policy that was certified in another task is damaged."""
     rows = read_certifications(folder, holding=f'"{_ELSEWHERE}"')
-    sizes = sizes_of(read_meta(folder)) if rows else None
-    firsts = [_from_row(folder, row, sizes) for row in rows if sizes is not None and row.rank == 0]
+    meta = read_meta(folder) if rows else None
+    firsts = [_from_row(folder, row, meta) for row in rows if meta is not None and row.rank == 0]
     return {one.elsewhere.title: one for one in firsts if one.elsewhere is not None}
 
 
@@ -265,7 +259,7 @@ def report_of(policies: Iterable[Certified], decision: Certified) -> Certified |
 
 def is_same_policy(one: Certified, other: Certified) -> bool:
     """Whether two certifications are of one policy."""
-    return all(ours.tobytes() == theirs.tobytes() for ours, theirs in zip(one.policy, other.policy, strict=True))
+    return one.policy.name == other.policy.name
 
 
 def measure_of(fitness: str) -> Measure:
@@ -327,18 +321,17 @@ def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
     return {name: array for name, array in vars(episodes).items() if array is not None}
 
 
-_POLICY = ("parameters_D", "observation_mean_O", "observation_std_O")
-_ELSEWHERE = "elsewhere"
+_NAME, _ELSEWHERE = "policy", "elsewhere"
 _FACTS = [
-    field.name for field in fields(Certified) if field.name not in (*_POLICY, _ELSEWHERE, "number", "rank", "episodes")
+    field.name for field in fields(Certified) if field.name not in (_NAME, _ELSEWHERE, "number", "rank", "episodes")
 ]
 _FACTS_ELSEWHERE = [field.name for field in fields(Elsewhere) if field.name != "episodes"]
 
 
 def stored(policy: Certified) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """(facts, arrays) of a certified policy, as they are stored."""
+    """(facts, arrays) of a certified policy, as they are stored; the arrays have the name of the policy itself."""
     facts = {name: getattr(policy, name) for name in _FACTS}
-    arrays = {name: getattr(policy, name) for name in _POLICY} | arrays_of(policy.episodes)
+    arrays = {_NAME: names([policy.policy.name]).reshape(()), **arrays_of(policy.episodes)}
     if (there := policy.elsewhere) is not None:
         facts[_ELSEWHERE] = {name: getattr(there, name) for name in _FACTS_ELSEWHERE}
         arrays |= {f"{_ELSEWHERE}_{name}": array for name, array in arrays_of(there.episodes).items()}
@@ -357,14 +350,17 @@ _EPISODES = {
     **dict.fromkeys(("return_E", "last_reward_E", "goal_distance_E", "descriptor_E_B"), REAL),
     "steps_E": INTEGER,
 }
-_NEEDED = {**dict.fromkeys(_POLICY, REAL), **_EPISODES}
+_NEEDED = {**POLICY, **_EPISODES}
 _MORE = {"success_E": BOOL}
 
 
-def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
-    """A certified policy of the store. Raises StoreError if it is none of a run of these sizes."""
-    prefix = f"{_ELSEWHERE}_"
+def _from_row(folder: Path, row: CertifiedRow, meta: RunMeta) -> Certified:
+    """A certified policy of the store. Raises StoreError if it is none of this run."""
+    sizes, prefix = sizes_of(meta), f"{_ELSEWHERE}_"
     arrays: dict[str, Any] = {name: array for name, array in row.arrays.items() if not name.startswith(prefix)}
+    if _NAME in arrays:  # else it is of a version before 0.28, and has the policy itself
+        policy = row.contents.get(arrays.pop(_NAME).tobytes(), {})
+        arrays |= {name: policy[name] for name in OF_POLICY if name in policy}
     there: dict[str, Any] = {
         name.removeprefix(prefix): array for name, array in row.arrays.items() if name.startswith(prefix)
     }
@@ -382,11 +378,13 @@ def _from_row(folder: Path, row: CertifiedRow, sizes: Sizes) -> Certified:
     if found or not lengths["E"]:
         which = f"row {row.rank} of certification {row.number}"
         raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
-    own = {name: arrays.pop(name) for name in _POLICY} | {name: facts[name] for name in _FACTS if name in facts}
+    own: dict[str, Any] = {"policy": policy_of(policy_spec(meta), arrays)}
+    own |= {name: facts[name] for name in _FACTS if name in facts}
+    of_episodes = {name: array for name, array in arrays.items() if name not in OF_POLICY}
     if (known := facts.get(_ELSEWHERE)) is not None:
         known = {name: known[name] for name in _FACTS_ELSEWHERE}
         own[_ELSEWHERE] = Elsewhere(**known, episodes=_episodes(there))
-    return Certified(row.number, row.rank, **own, episodes=_episodes(arrays))
+    return Certified(row.number, row.rank, **own, episodes=_episodes(of_episodes))
 
 
 def _episodes(arrays: Mapping[str, Any]) -> Episodes:

@@ -19,11 +19,12 @@ from es_service.config.tasks import task_of
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.arrays import BEST, CENTRES, OBSERVATIONS
 from es_service.loop.generation import evaluate_centres
+from es_service.protocol.content import Policy
 from es_service.protocol.evaluator import Evaluator, completed
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments
 from es_service.runs.checked_config import changed_config
 from es_service.runs.engine import engine_here
-from es_service.runs.snapshot import Policy, Snapshot, make_policy
+from es_service.runs.snapshot import Snapshot, acting
 from es_service.runs.view import Run, named_best
 from es_service.runs.worker_count import on_this_machine, require_cores
 from es_service.search.observation_statistics import merge_moments, moments_of
@@ -146,10 +147,11 @@ def candidates(
     for cell, elite in elites.items():
         row = map_.row_of(cell)
         assert row is not None
-        policy = make_policy(run.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
         name = ",".join(map(str, map_.geometry.index_of(cell)))
         evaluated = int(map_.generation_N[row]), float(map_.fitness_N[row])
-        chosen.append(Candidate(name, policy, *evaluated, cell, int(map_.centre_N[row]), elite.trace_T_B))
+        chosen.append(
+            Candidate(name, acting(run.meta, elite), *evaluated, cell, int(map_.centre_N[row]), elite.trace_T_B)
+        )
     return chosen
 
 

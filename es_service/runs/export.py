@@ -188,7 +188,12 @@ def ribs_archive(run: Run) -> Any:
 
 
 def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[str, np.ndarray]:
-    fields = {"parameters": "centre_D", "mean": "observation_mean_O", "std": "observation_std_O", "trace": "trace_T_B"}
+    fields = {
+        "parameters": "parameters_D",
+        "mean": "observation_mean_O",
+        "std": "observation_std_O",
+        "trace": "trace_T_B",
+    }
     sizes = {"parameters": (run.policy_spec.parameters,), "trace": (0, len(map_.geometry.bounds))}
     none = run.policy_spec.widths[:1]
     return {
@@ -216,7 +221,7 @@ def _parameters(snapshot: Snapshot, spec: ParameterSpec, *, has_map: bool) -> pd
     if has_map:
         map_, elites = snapshot.elites()
         places = [",".join(map(str, place)) for place in map_places(map_).reshape(map_.size, -1).tolist()]
-        rows |= zip(places, (elite.centre_D for elite in elites.values()), strict=True)
+        rows |= zip(places, (elite.parameters_D for elite in elites.values()), strict=True)
     table = pd.DataFrame(spec.values(np.stack(list(rows.values()))), columns=pd.Index(spec.names))
     table.insert(0, "which", list(rows), allow_duplicates=True)
     return table

@@ -32,9 +32,10 @@ from es_service.loop.arrays import (
     value_of,
 )
 from es_service.loop.state import RunState
+from es_service.protocol.content import Policy
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config, changes_from
-from es_service.runs.snapshot import Policy, Snapshot, make_policy
+from es_service.runs.snapshot import Snapshot
 from es_service.runs.view import Run, named_best, named_by_all, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreState, FitnessWeight, SearchState
@@ -231,15 +232,13 @@ def _several(
             run=origin.folder,
         )
     snapshot = origin.at(wanted=[BEST, MAP, ARCHIVE], named=named_by_all)
-    policies = [snapshot.policy("best")]
+    policies: list[Policy] = [snapshot.policy("best")]
     if origin.constants["map.enabled"]:
         map_, elites = snapshot.elites()
-        for row in _by_choice(snapshot, map_, config, search):
-            elite = elites[int(map_.cell_N[row])]
-            policies.append(make_policy(origin.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O))
+        policies += [elites[int(map_.cell_N[row])] for row in _by_choice(snapshot, map_, config, search)]
     different: dict[bytes, Policy] = {}
     for policy in policies:  # the best centre is often an elite
-        different.setdefault(policy.parameters_D.tobytes() + policy.observation_mean_O.tobytes(), policy)
+        different.setdefault(policy.name, policy)
     chosen = list(different.values())[: search.screened]
     _tell_otherwise(origin, config, tell)
     start = {

@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from es_service.loop.generation import episodes_of
 from es_service.loop.policies import policy_work
+from es_service.protocol.content import Policy
 from es_service.protocol.episodes import part_of
 from es_service.protocol.evaluator import Evaluator, completed
-from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain
 
 FIRST_EPISODES = 16
 """Selection episodes of each candidate in the first round; each later round has twice as many as the one before."""
-Parameters = tuple[FloatArray, FloatArray, FloatArray]
-"""A policy to run: its parameters [D], and mean and standard deviation of its observations, [O] each."""
 
 
 Measure = Literal["return", "last_reward", "success", "goal_distance"]
@@ -120,7 +119,7 @@ class SelectionRecord:
 
 
 def halved(
-    engine: Evaluator, given: Sequence[Parameters], seed: int, number: int, keep: int, by: Measure
+    engine: Evaluator, given: Sequence[Policy], seed: int, number: int, keep: int, by: Measure
 ) -> tuple[list[SelectionRecord], int]:
     """The `keep` best candidates by successive halving, best first, and the environment steps that it took.
 
@@ -143,21 +142,21 @@ def halved(
 
 
 def new_episodes(
-    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
+    engine: Evaluator, policies: Sequence[Policy], episodes: int, seed: int, number: int, ask: int, domain: Domain
 ) -> list[Episodes]:
     """What is kept of new episodes of each policy; arguments as of `results_of`."""
     return [kept(result) for result in results_of(engine, policies, episodes, seed, number, ask, domain)]
 
 
 def results_of(
-    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int, ask: int, domain: Domain
+    engine: Evaluator, policies: Sequence[Policy], episodes: int, seed: int, number: int, ask: int, domain: Domain
 ) -> list[EpisodesResult]:
     """Results [E] of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
     number, ask) determines."""
     asked = [
         policy_work(
-            parameters_D[None],
-            (mean_O[None], std_O[None]),
+            policy.parameters_D[None],
+            (policy.observation_mean_O[None], policy.observation_std_O[None]),
             episodes,
             seed=seed,
             generation=number,
@@ -165,7 +164,7 @@ def results_of(
             request=request,
             domain=domain,
         )
-        for request, (parameters_D, mean_O, std_O) in enumerate(policies)
+        for request, policy in enumerate(policies)
     ]
     results, _ = completed(episodes_of([(each.work, each.shape) for each in asked]), engine.evaluate)
     return [part_of(result, 0) for result in results]

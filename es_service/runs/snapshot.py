@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from es_service.errors import NotInRunError
 from es_service.loop.arrays import ARCHIVE, BEST, MAP, OBSERVATIONS, Nodes, centre_path, value_of
-from es_service.loop.contents import elite_of
+from es_service.loop.contents import stored_elite, stored_policy
 from es_service.loop.state import Best, statistics_in_force
+from es_service.protocol import content
 from es_service.protocol.content import Contents, as_bytes
-from es_service.protocol.messages import FloatArray, Moments, PolicySpec
+from es_service.protocol.messages import FloatArray, Moments
 from es_service.runs.strangers import policy_spec
 from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True)
-class Policy:
+@dataclass(frozen=True, eq=False)
+class Policy(content.Policy):
     """A trained controller that needs only NumPy: observation [O] or [..., O] -> action [..., A].
 
     It includes the observation statistics that it runs with. A policy with a memory is called through `start`.
@@ -40,10 +41,6 @@ class Policy:
     layout; on a processor of another kind, the last bits of an action may differ.
     """
 
-    spec: PolicySpec
-    parameters_D: FloatArray = field(repr=False)
-    observation_mean_O: FloatArray = field(repr=False)
-    observation_std_O: FloatArray = field(repr=False)
     observation_clip: float | None
     certified: Mapping[str, Mapping[str, float | int | None]] = field(default_factory=dict, repr=False)
     """Of `policy("certified")`: title of a task -> means with their intervals and successes there, by the names of the
@@ -179,7 +176,11 @@ class Snapshot:
         map_ = self.behaviour_map
         chosen = map_.cell_N.tolist() if cells is None else cells
         names = {cell: map_names(map_, [cell]) for cell in chosen}
-        return map_, {cell: elite_of(*(self.contents[name] for name in of_cell)) for cell, of_cell in names.items()}
+        spec = policy_spec(self.meta)
+        elites = {
+            cell: stored_elite(spec, *(self.contents[name] for name in of_cell)) for cell, of_cell in names.items()
+        }
+        return map_, elites
 
     @property
     def best(self) -> Best:
@@ -217,16 +218,16 @@ class Snapshot:
     def policy(self, which: Literal["best", "centre"]) -> Policy:
         """The best or the newest centre as a policy; see `Run.policy`."""
         if which == "best":
-            best = elite_of(self.contents[self.best.policy.tobytes()])
-            return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
+            return acting(self.meta, stored_policy(policy_spec(self.meta), self.contents[self.best.policy.tobytes()]))
         (centre, _), enabled = self.require_newest_centre(), self.meta.constants["policy.observation_normalization"]
         mean_O, std_O = statistics_in_force(value_of(Moments, self.nodes, OBSERVATIONS), centre, enabled)
-        return make_policy(self.meta, centre.centre_D, mean_O, std_O)
+        return acting(self.meta, content.Policy(policy_spec(self.meta), centre.centre_D, mean_O, std_O))
 
 
-def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
-    """A policy with the network and the observation clip of a run."""
-    return Policy(policy_spec(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
+def acting(meta: RunMeta, policy: content.Policy) -> Policy:
+    """A policy of a run, which acts with the run's observation clip."""
+    of_policy = (policy.spec, policy.parameters_D, policy.observation_mean_O, policy.observation_std_O)
+    return Policy(*of_policy, meta.constants["policy.observation_clip"])
 
 
 def map_names(map_: BehaviourMap, cells: Collection[int]) -> list[bytes]:

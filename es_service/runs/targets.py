@@ -17,6 +17,7 @@ from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.loop.interfaces import Stop
+from es_service.protocol.content import Policy
 from es_service.protocol.noise import Domain
 from es_service.runs.certification import Named, add_certified, different, opened, platform_of, workers_for
 from es_service.runs.certified import (
@@ -29,7 +30,7 @@ from es_service.runs.certified import (
     report_of,
 )
 from es_service.runs.evaluation import candidates
-from es_service.runs.selection import Episodes, Parameters, new_episodes
+from es_service.runs.selection import Episodes, new_episodes
 from es_service.runs.view import open_run
 
 BEST = "best"
@@ -51,7 +52,7 @@ def certify_best(
     with opened(run, workers, on_notice) as (store, local), workers_for(local, on_notice, on_output) as engine:
         [best] = different(candidates(run, best=True, centre=False, cells=(), every=False))
 
-        def episodes_of(policy: Parameters, number: int, domain: Domain) -> Episodes:
+        def episodes_of(policy: Policy, number: int, domain: Domain) -> Episodes:
             [episodes] = new_episodes(engine, [policy], EPISODES, config.seed, number, 0, domain)
             return episodes
 
@@ -74,7 +75,7 @@ def attempt(
     target: float,
     fitness: str,
     platform: Mapping[str, Any],
-    episodes_of: Callable[[Parameters, int, Domain], Episodes],
+    episodes_of: Callable[[Policy, int, Domain], Episodes],
 ) -> Iterator[Certified]:
     """What a run needs next: a decision on its best centre, unless one has passed already, and after a pass, the
     certified value of the policy that has passed.
@@ -103,9 +104,7 @@ def attempt(
             tries=len(before) + 1,
             platform=platform,
             episodes=episodes_of(best.policy, number, Domain.DECISION_RESET),
-            parameters_D=best.policy[0],
-            observation_mean_O=best.policy[1],
-            observation_std_O=best.policy[2],
+            policy=best.policy,
         )
         yield decision
         before, number = [*before, decision], number + 1

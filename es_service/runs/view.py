@@ -25,7 +25,7 @@ from es_service.runs.certified import (
     is_same_policy,
     newest_certified,
 )
-from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, map_names
+from es_service.runs.snapshot import Policy, Snapshot, acting, descriptor_names, map_names
 from es_service.runs.strangers import policy_spec, sound_contents, sound_meta, sound_nodes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
@@ -294,12 +294,11 @@ class Run:
                 raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])
             values = certified_by_task(self.folder).items()
             values = {task: one.episodes.values() for task, one in values if is_same_policy(one.policy, policy)}
-            return replace(make_policy(self.meta, *policy.policy), certified=values)
+            return replace(acting(self.meta, policy.policy), certified=values)
         if isinstance(which, str):
             allowed = "'best', 'centre', 'certified', or a cell such as (3, 17)"
             raise ConfigError(f"policy({which!r}): choose {allowed}", field="which", value=which, allowed=allowed)
-        elite = self.elite(which)
-        return make_policy(self.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+        return acting(self.meta, self.elite(which))
 
     def parameters(
         self, which: Literal["best", "centre", "certified"] | int | Sequence[int] = "best"

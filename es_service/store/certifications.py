@@ -1,7 +1,7 @@
-"""The table of certified policies: their values in fresh episodes, outside the digest, and the policies themselves.
+"""The table of certified policies: their values in fresh episodes, outside the digest, and the names of the policies.
 
 A certification is a few rows that are added together. Rows are never changed, belong to no generation, and are not
-copied by a fork.
+copied by a fork. A policy that a row names is stored as long as the row.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service.protocol.content import Contents
 from es_service.store.codec import Part, decode_part, encode_part
 from es_service.store.facts import Count, Damaged, facts, require_form
 
@@ -37,6 +38,13 @@ class CertifiedRow:
     facts: Mapping[str, Any]
     """Values that JSON can represent."""
     arrays: Mapping[str, NDArray[Any]]
+    contents: Contents = field(default_factory=dict)
+    """What the arrays name, where it was read."""
+
+
+def row_name(number: int, rank: int) -> tuple[str, int]:
+    """What a row is called beside rows of the state, in `states.Named`."""
+    return f"{CERTIFICATIONS}/{rank}", number
 
 
 def insert(connection: sqlite3.Connection, number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> None:

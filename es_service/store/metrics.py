@@ -19,7 +19,7 @@ from es_service.loop.history import METRIC
 from es_service.protocol.outputs import NAME_OF_METRIC
 from es_service.store.codec import text_sha256
 from es_service.store.facts import Damaged, Finite, facts
-from es_service.store.schema import METRICS, SCHEMA, SCHEMA_WITH_METRICS, put_meta
+from es_service.store.schema import EXTENDED_SCHEMA, METRICS, SCHEMA, put_meta
 from es_service.store.tables import Columns
 
 _Named = dict[Annotated[str, StringConstraints(pattern=f"^{NAME_OF_METRIC}$")], Finite]
@@ -29,7 +29,7 @@ def record(connection: sqlite3.Connection, generation: int, named: Mapping[str, 
     """Store the metrics of a generation, in place of those that it has; what is not finite is left out."""
     if not are_there(connection):
         connection.execute(METRICS)
-        put_meta(connection, SCHEMA, str(SCHEMA_WITH_METRICS))
+        put_meta(connection, SCHEMA, str(EXTENDED_SCHEMA))
     text = json.dumps({name: float(value) for name, value in named.items() if math.isfinite(value)}, sort_keys=True)
     row = (generation, text, text_sha256(f"metric {generation}", text))
     connection.execute("INSERT OR REPLACE INTO metric (generation, named, sha256) VALUES (?, ?, ?)", row)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
+from es_service.protocol.content import names_in
 from es_service.store import certifications, metrics
 from es_service.store.beginning import load_start
 from es_service.store.certifications import CertifiedRow
@@ -234,5 +236,10 @@ def read_certifications(
         for (number, rank), row in certifications.rows(connection, newest, holding):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} is damaged")
-            rows.append(row)
+            try:
+                contents = {name: sound_content(connection, name) for name in names_in(row.arrays)}
+            except KeyError as lacking:
+                which = f"row {rank} of certification {number}"
+                raise Damaged(f"{which} names the content {lacking.args[0].hex()}, which is missing") from lacking
+            rows.append(replace(row, contents=contents))
         return rows

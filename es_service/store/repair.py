@@ -110,9 +110,9 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
             connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
         connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
         connection.execute("REINDEX content")
-        collect_contents(connection)
         certifications.remove(connection, verdict.bad_certifications)
         metrics.remove(connection, verdict.good)
+        collect_contents(connection)
     if verdict.good == verdict.newest:
         notices.append(
             f"{file}: {damage}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"

@@ -19,8 +19,9 @@ from es_service.store.facts import Damaged, RunFacts, column_problem, facts, req
 SCHEMA = "schema_version"
 """Record of the table `meta` with the schema version."""
 SCHEMA_VERSION = 8
-SCHEMA_WITH_METRICS = 9
-"""That of runs with the table `metric`, which version 0.27 does not know."""
+EXTENDED_SCHEMA = 9
+"""That of runs with metrics that a program has recorded, or with a certified policy that is stored under its name:
+version 0.27 does not know the one, and would delete the other."""
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0", 6: "0.25.0", 7: "0.25.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
@@ -31,7 +32,8 @@ GENERATION_TABLES = ("state", "history", "platform")
 """Tables whose rows belong to a generation; falling back to a generation deletes the newer rows of each table.
 
 A new table of this kind must be added here. Its rows must be hashed into the history row of their generation, as those
-of the state are; otherwise the loss of a row is not noticed. The table content has what rows of the state name."""
+of the state are; otherwise the loss of a row is not noticed. The table content has what rows of the state and of
+certified policies name."""
 
 _META = "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, sha256 TEXT NOT NULL) WITHOUT ROWID"
 _STATE = (
@@ -141,10 +143,10 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
             raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
     records = {key: value for key, value, _ in rows}
     version = facts(records.get(SCHEMA, "0"), int, "its schema version")
-    if version > SCHEMA_WITH_METRICS:
+    if version > EXTENDED_SCHEMA:
         raise StoreError(
             f"{file} has schema version {version}; this version of es-service supports versions up to "
-            f"{SCHEMA_WITH_METRICS}. Upgrade es-service to read or continue the run."
+            f"{EXTENDED_SCHEMA}. Upgrade es-service to read or continue the run."
         )
     if version < 1 or "run" not in records:
         raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")

@@ -121,8 +121,9 @@ def insert_contents(connection: sqlite3.Connection, contents: Iterable[tuple[byt
 
 
 def collect_contents(connection: sqlite3.Connection) -> None:
-    """Delete the contents that no row of the state names."""
-    payloads = connection.execute("SELECT payload FROM state WHERE length(payload) > 0")
+    """Delete the contents that nothing names: no row of the state, and none of a certified policy."""
+    tables = (f"SELECT payload FROM {table} WHERE length(payload) > 0" for table in ("state", "certification"))
+    payloads = connection.execute(" UNION ALL ".join(tables))
     named = frozenset[bytes]().union(*(names_in(decode_part(payload)) for (payload,) in payloads))
     stored = [name for (name,) in connection.execute("SELECT name FROM content")]
     connection.executemany("DELETE FROM content WHERE name IS ?", [(name,) for name in stored if name not in named])
@@ -152,8 +153,8 @@ class KeptStates:
     """The stored state rows, as the writer of a run follows them from commit to commit."""
 
     def __init__(self, connection: sqlite3.Connection, rows: KeptRows, named: Named, newest: int | None) -> None:
-        """`rows`: all intact rows that are stored; `named`: what they name; `newest`: newest generation, None if there
-        is none."""
+        """`rows`: all intact rows that are stored; `named`: what they and those of certified policies name; `newest`:
+        newest generation, None if there is none."""
         self._rows, self._named = rows, dict(named)
         self._count = Counter(name for names in named.values() for name in names)
         """Number of rows that name each content."""
@@ -203,20 +204,37 @@ class KeptStates:
             named: what its rows name.
             outdated: rows that it deletes.
         """
-        change = Counter(name for names in named.values() for name in names)
-        change.subtract(name for row in outdated for name in self._named.get(row, ()))
+        change = self._change(named, outdated)
         added = [name for name in change if name not in self._count]
         return added, [name for name, by in change.items() if self._count[name] + by == 0]
+
+    def _change(self, named: Named, outdated: Iterable[tuple[str, int]]) -> Counter[bytes]:
+        """By how much the number of rows that name each content changes, where it may change; arguments as of
+        `named_after`."""
+        change = Counter[bytes]()
+        going = {part: names for part, at in outdated if (names := self._named.get((part, at)))}
+        for (part, _), names in named.items():  # most of them are also in the older row of the part
+            before = going.pop(part, frozenset())
+            change.update(names - before)
+            change.subtract(before - names)
+        for names in going.values():
+            change.subtract(names)
+        return change
+
+    def add_named(self, named: Named, outdated: Iterable[tuple[str, int]] = ()) -> None:
+        """Follow what new rows name, of the state or of certified policies; arguments as of `named_after`."""
+        for name, by in self._change(named, outdated).items():
+            self._count[name] += by
+            if not self._count[name]:
+                del self._count[name]
+        for row in outdated:
+            self._named.pop(row, None)
+        self._named |= named
 
     def commit(self, new: ListedRows, named: Named, outdated: Iterable[tuple[str, int]], total: int) -> None:
         """Follow a commit, with what `total_after` and `outdated` have returned for it."""
         self.total = total
-        self._count.update(name for names in named.values() for name in names)
-        for name in [name for row in outdated for name in self._named.pop(row, ())]:
-            self._count[name] -= 1
-            if not self._count[name]:
-                del self._count[name]
-        self._named |= named
+        self.add_named(named, outdated)
         for part, at in outdated:
             del self._rows[part][at]
             if not self._rows[part]:

@@ -34,7 +34,7 @@ class Verdict:
     kept: KeptRows
     """Intact state rows, whose contents are intact, too."""
     named: Named
-    """Names of contents in these rows, where there are any."""
+    """Names of contents in these rows and in those of certified policies, where there are any."""
     bad_rows: tuple[tuple[str, int], ...]
     """Damaged state rows as (part, generation), which must be deleted."""
     bad_certifications: tuple[certifications.Key, ...]
@@ -86,6 +86,13 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     count, sound = _history(connection, meta, first, problems)
     contents = _contents(connection, problems)
     kept, named, bad_rows = _state(connection, contents, problems)
+    bad_certified: list[certifications.Key] = []
+    for key, row in certifications.rows(connection):
+        names = frozenset[bytes]() if row is None else names_in(row.arrays)
+        if row is None or not names <= contents:
+            bad_certified.append(key)
+        elif names:
+            named[certifications.row_name(*key)] = names
     unnamed = contents.difference(*named.values())
     problems += [f"the content {name.hex()} is named by nothing" for name in sorted(unnamed)]
     newest = count - 1 if count else None
@@ -96,7 +103,6 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         lost = 0 if good is None else good + 1
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
-    bad_certified = [key for key, row in certifications.rows(connection) if row is None]
     problems += [f"row {rank} of certification {number} is damaged" for number, rank in bad_certified]
     damaged = metrics.recorded(connection)[1]
     problems += [f"the metrics recorded at generation {at} are damaged" for at in damaged]

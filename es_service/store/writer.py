@@ -34,7 +34,7 @@ from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound, patience
 from es_service.store.rows import history_rows, insert_history
-from es_service.store.schema import RunMeta
+from es_service.store.schema import EXTENDED_SCHEMA, SCHEMA, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_contents, insert_state, sound_content, sound_part
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
@@ -143,11 +143,11 @@ class RunStore:
             return sound_part(self._connection, name, *row)
 
     def contents(self) -> list[bytes]:
-        """Names of the contents that the stored states name."""
+        """Names of the contents that the stored states and the certified policies name."""
         return self._kept.contents()
 
     def content(self, name: bytes) -> dict[str, NDArray[Any]]:
-        """A content that a stored state names, such as a policy: name -> array. Raises as `part`."""
+        """A content that is named, such as a policy: name -> array. Raises as `part`."""
         with self._loading():
             return sound_content(self._connection, name)
 
@@ -195,8 +195,7 @@ class RunStore:
         total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
         named = {(part, generation): names for part, arrays in parts.items() if (names := names_in(arrays or {}))}
         added, unnamed = self._kept.named_after(named, outdated)
-        if lacking := [name.hex() for name in added if name not in contents]:
-            raise StoreError(f"{self.folder}: generation {generation} names {lacking[0]}, which nobody has")
+        self._require_known(added, contents, f"generation {generation}")
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as connection:
             # Delete first, so that the new rows use the pages of the old ones.
@@ -215,6 +214,11 @@ class RunStore:
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(rows))
         self.upkeep.after_commit()
+
+    def _require_known(self, added: Sequence[bytes], contents: Mapping[bytes, Part], what: str) -> None:
+        """Raise StoreError if a name that is not stored yet is not among the contents."""
+        if lacking := [name.hex() for name in added if name not in contents]:
+            raise StoreError(f"{self.folder}: {what} names {lacking[0]}, which nobody has")
 
     def last_history(self) -> dict[str, int | float] | None:
         """History row of the newest generation; NaN stands for no value. None before the first commit."""
@@ -253,12 +257,25 @@ class RunStore:
         with self._explaining("reading the certifications"):
             return certifications.next_number(self._connection, self.meta.parent)
 
-    def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
-        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank. Raises
-        StoreError if the database cannot be written."""
+    def add_certification(
+        self, policies: Sequence[tuple[Mapping[str, Any], Part]], contents: Mapping[bytes, Part]
+    ) -> None:
+        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
+
+        Args:
+            contents: contents by name, among them those that the arrays name and that are not stored yet.
+
+        Raises StoreError if the arrays name what nobody has, or if the database cannot be written.
+        """
         number = self.next_certification
+        named = {certifications.row_name(number, rank): names_in(arrays) for rank, (_, arrays) in enumerate(policies)}
+        added, _ = self._kept.named_after(named, ())
+        self._require_known(added, contents, f"certification {number}")
         with self._transaction("storing a certification") as connection:
+            put_meta(connection, SCHEMA, str(EXTENDED_SCHEMA))
+            insert_contents(connection, ((name, contents[name]) for name in added))
             certifications.insert(connection, number, policies)
+        self._kept.add_named(named)
         self.upkeep.after_commit()
 
     def record_metrics(self, generation: int, named: Mapping[str, float]) -> None:

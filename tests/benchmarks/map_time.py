@@ -27,7 +27,7 @@ from es_service.loop import driver
 from es_service.loop.arrays import state_of, stored
 from es_service.loop.history import history_columns
 from es_service.loop.state import RunState
-from es_service.protocol.content import Arrays, name_of, names, policy_content
+from es_service.protocol.content import Arrays, Policy, name_of, names
 from es_service.protocol.episodes import addressed
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
@@ -83,7 +83,7 @@ def filled(state: RunState, spec: PolicySpec, contents: dict[bytes, Arrays]) -> 
     columns["fitness_N"][map_.size :] = -1e6
     trace = {"trace_T_B": np.zeros((64, 2), np.float32)}
     policies = [
-        policy_content(spec, *(rng.normal(size=size).astype(np.float32) for size in (spec.parameters, size, size)))
+        Policy(spec, *(rng.normal(size=size).astype(np.float32) for size in (spec.parameters, size, size))).content
         for _ in range(count - map_.size)
     ]
     contents |= {name_of(content): content for content in (trace, *policies)}

@@ -91,6 +91,10 @@ def policy(generation, seed=0):
     return {"parameters_D": values.astype(np.float32)}
 
 
+OTHER = {"parameters_D": np.arange(40, dtype=np.float32)}
+"""A policy that no state names, but a certification may."""
+
+
 def contents_of(generation, seed=0):
     """What a generation's parts name, as far as they are new."""
     content = policy(generation, seed)
@@ -199,11 +203,12 @@ def assert_same_state(found, expected):
 
 
 def assert_policies(folder, generation):
-    """The policies that this generation's state names are there, and all that are there are named by a state row."""
-    expected = {name: content for at in range(7) for name, content in contents_of(at).items()}
+    """The policies that this generation's state names are there, and all that are there are named."""
+    expected = {name: content for at in range(7) for name, content in contents_of(at).items()} | {name_of(OTHER): OTHER}
     with reading(folder) as (connection, _):
         stored = {name for (name,) in connection.execute("SELECT name FROM content")}
-        rows = [decode_part(payload) for (payload,) in connection.execute("SELECT payload FROM state") if payload]
+        payloads = connection.execute("SELECT payload FROM state UNION ALL SELECT payload FROM certification")
+        rows = [decode_part(payload) for (payload,) in payloads if payload]
         assert named_at(generation).keys() <= stored == frozenset().union(*map(names_in, rows))
         for name in stored:
             assert_same_state({"": sound_content(connection, name)}, {"": expected[name]})

@@ -6,7 +6,7 @@ import pytest
 
 from es_service.errors import EvaluationError
 from es_service.loop.contents import Contents
-from es_service.protocol.content import name_of, names, policy_content
+from es_service.protocol.content import Policy, name_of, names, policy_of
 from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import PolicyAsk
@@ -82,7 +82,8 @@ def test_policies_are_read_only(store):
 
 
 def policy(value):
-    return policy_content(SPEC, np.full(6, value, np.float32), np.full(2, value, np.float32), np.ones(2, np.float32))
+    of_policy = np.full(6, value, np.float32), np.full(2, value, np.float32), np.ones(2, np.float32)
+    return Policy(SPEC, *of_policy).content
 
 
 def test_policies_that_are_asked_for_by_name_get_their_parameters_and_statistics(store):
@@ -105,7 +106,7 @@ def test_a_policy_that_nobody_has_is_named(store):
 def test_a_name_is_that_of_the_content_alone():
     one = policy(1)
     assert name_of(one) == name_of({name: one[name].copy() for name in reversed(one)})
-    other = policy_content(PolicySpec((2, 2), bias=False), *(one[name] for name in list(one)[:3]))
+    other = policy_of(PolicySpec((2, 2), bias=False), one).content
     changed = [{**one, "parameters_D": one["parameters_D"] + 0.0 * np.float32(-1)}, policy(2), other]
     assert len({name_of(one), *map(name_of, changed[1:])}) == 3
     assert name_of(changed[0]) == name_of(one)

@@ -13,7 +13,7 @@ from es_service.report import maps
 from es_service.report.data import read_run
 from es_service.report.detours import crosses, detours
 from es_service.report.floor import plan_frame
-from es_service.runs.snapshot import make_policy
+from es_service.runs.snapshot import acting
 from tests.references import point_maze
 from workers.environments import SHIPPED
 
@@ -111,7 +111,7 @@ def lines_of(path_T_2, around):
 
 def episode(run, elite):
     """All steps of an elite's stored episode, by the reference implementation, [T, 2]."""
-    policy = make_policy(run.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+    policy = acting(run.meta, elite)
     place, done = tuple(map(float, elite.trace_T_B[0])), False
     path = [place]
     while len(path) <= POINT.episode_steps:

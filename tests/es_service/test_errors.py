@@ -103,4 +103,4 @@ def test_a_missing_cell_suggests_the_nearest(tmp_path):
     with pytest.raises(LookupError, match="is empty; the nearest filled cell is") as caught:
         run.elite(empty)
     assert (caught.value.field, caught.value.value) == ("cell", empty)
-    assert run.elite(caught.value.suggestion).centre_D.shape == run.elite(cell).centre_D.shape
+    assert run.elite(caught.value.suggestion).parameters_D.shape == run.elite(cell).parameters_D.shape

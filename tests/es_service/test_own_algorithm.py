@@ -249,7 +249,7 @@ def test_elites_are_those_that_the_map_says_entered(tmp_path):
     assert set(map_.generation_N.tolist()) <= {1, 4}
     norms = run.history["parameter_norm"]
     for cell, generation in zip(map_.cell_N.tolist(), map_.generation_N.tolist(), strict=True):
-        norm = np.linalg.norm(elites[cell].centre_D.astype(np.float64))
+        norm = np.linalg.norm(elites[cell].parameters_D.astype(np.float64))
         assert norm == pytest.approx(norms[generation], rel=1e-6)
 
 

@@ -91,7 +91,7 @@ def test_the_policy_of_an_elite_is_that_of_its_first_evaluation(run):
         assert set(elites) == set(map_.cell_N.tolist())
         for cell, of, centre in zip(map_.cell_N.tolist(), map_.generation_N, map_.centre_N, strict=True):
             assert centre == 0
-            np.testing.assert_array_equal(elites[cell].centre_D, centres[of])
+            np.testing.assert_array_equal(elites[cell].parameters_D, centres[of])
 
 
 @pytest.mark.parametrize("stop", [1, 11, 12])

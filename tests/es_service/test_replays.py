@@ -130,7 +130,8 @@ def test_elites_are_of_the_generation_in_which_they_were_chosen_also_while_a_dri
     assert run.generation == 12
     np.testing.assert_array_equal(map_.centre_N, before_map.centre_N)
     then, now, later = (
-        {cell: elite.centre_D.tolist() for cell, elite in some.items()} for some in (before, elites, run.elites()[1])
+        {cell: elite.parameters_D.tolist() for cell, elite in some.items()}
+        for some in (before, elites, run.elites()[1])
     )
     assert now == then
     assert now != {cell: later[cell] for cell in now if cell in later}, "some have been replaced"

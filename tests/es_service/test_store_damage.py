@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.protocol.content import name_of, names_in
+from es_service.protocol.content import name_of, names, names_in
 from es_service.store import repair
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
 from es_service.store.connection import connected_to
 from es_service.store.digest import checked_parts, digest_parts
 from es_service.store.reader import (
+    read_certifications,
     read_evaluations,
     read_generation,
     read_history,
@@ -27,6 +28,7 @@ from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
 from tests.database import database, execute
 from tests.es_service.store_examples import (
+    OTHER,
     advance,
     assert_policies,
     assert_same_history,
@@ -239,6 +241,67 @@ def test_a_damaged_index_of_the_contents_is_noticed_and_made_again(tmp_path):
         assert_sound(folder, 5)
         assert digest(folder) == uninterrupted
     assert len(places) > 2, "the policy, its index, and the blocks that name it"
+
+
+def certified(*contents):
+    """A certification of policies: their rows, and the policies by name."""
+    rows = [({}, {"policy": names([name_of(content)]).reshape(())}) for content in contents]
+    return rows, {name_of(content): content for content in contents}
+
+
+def test_a_certified_policy_stays_while_no_state_names_it(tmp_path):
+    folder = tmp_path / "run"
+    with create(folder, generations=1) as run:
+        run.add_certification(*certified(OTHER, policy(0)))
+        run.add_certification(*certified(OTHER))
+        rows, contents = certified({"parameters_D": OTHER["parameters_D"] + 1})
+        with pytest.raises(StoreError, match=f"certification 2 names {next(iter(contents)).hex()}, which nobody has"):
+            run.add_certification(rows, {})
+        advance(run, 11)
+    assert_sound(folder, 11)
+    uninterrupted = digest(folder)
+    damage_states(folder, (11,))
+    with RunStore.open(folder) as run:
+        assert run.generation == 10
+        assert np.array_equal(run.content(name_of(OTHER))["parameters_D"], OTHER["parameters_D"])
+        advance(run, 11)
+    assert_sound(folder, 11)
+    assert digest(folder) == uninterrupted
+    assert [[*row.contents] for row in read_certifications(folder)] == [
+        [name_of(content)] for content in (OTHER, policy(0), OTHER)
+    ]
+
+
+@pytest.mark.parametrize("damage", ["DELETE FROM content", "UPDATE content SET payload = x'00'"])
+def test_a_certification_whose_policy_is_damaged_goes_and_so_does_the_policy(tmp_path, damage):
+    folder = tmp_path / "run"
+    with create(folder, generations=1) as run:
+        run.add_certification(*certified(OTHER))
+        run.add_certification(*certified(policy(0)))
+        advance(run, 3)
+    execute(folder, f"{damage} WHERE name = x'{name_of(OTHER).hex()}'")
+    with pytest.raises(StoreError, match=r"row 0 of certification 0 names the content|does not match its name"):
+        read_certifications(folder)
+    with RunStore.open(folder) as run:
+        assert "row 0 of certification 0 is damaged" in run.notices[0]
+        assert name_of(OTHER) not in run.contents()
+        assert run.next_certification == 2
+    assert_sound(folder, 3)
+    assert [[*row.contents] for row in read_certifications(folder)] == [[name_of(policy(0))]]
+
+
+def test_a_damaged_index_of_the_contents_loses_no_certification(tmp_path):
+    folder, name, left = tmp_path / "run", name_of(OTHER), []
+    with create(folder, generations=3) as run:
+        run.add_certification(*certified(OTHER))
+    content = (folder / "run.db").read_bytes()
+    for place in [at for at in range(len(content)) if content.startswith(name, at)]:
+        (folder / "run.db").write_bytes(content)
+        flip_bit(folder / "run.db", place + 20)
+        RunStore.open(folder).close()
+        assert_sound(folder, 2)
+        left.append(len(read_certifications(folder)))
+    assert sorted(left) == [0, 0, 1], "its row, the policy, and the index of the policies"
 
 
 def kept_run(folder, last, every=4):

@@ -29,6 +29,7 @@ from es_service.runs.certified import (
 from es_service.runs.selection import Episodes, false_pass_share, mean_interval
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
+from tests.helpers import policy_with
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
@@ -284,7 +285,7 @@ def test_the_interval_of_what_ends_a_run_holds_the_truth_in_95_of_100_made_up_ru
                 return made_up_episodes(kind, np.random.default_rng([run, number, domain]), truth)
 
             assert targets.due_after(policies, target, "sum")({"best_fitness": fitness})
-            best = Named("best", (np.array([tried]), np.zeros(1), np.ones(1)), tried, fitness)
+            best = Named("best", policy_with(np.array([tried], np.float32)), tried, fitness)
             policies += targets.attempt(policies, best, len(policies), target, "sum", {}, episodes_of)
             if not policies[-1].decides:
                 break

@@ -16,6 +16,7 @@ from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, RunLockedError, StoreError
 from es_service.loop.policies import policy_work
+from es_service.protocol.content import OF_POLICY
 from es_service.protocol.episodes import gathered
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import EpisodesResult
@@ -29,6 +30,9 @@ from es_service.runs.export import arrays
 from es_service.runs.selection import mean_interval, share_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
+from es_service.store import certifications
+from es_service.store.codec import decode_part, encode_part
+from es_service.store.schema import EXTENDED_SCHEMA, get_meta, put_meta
 from es_service.store.writer import RunStore
 from tests.database import database, execute
 from tests.helpers import DirectEvaluator
@@ -138,7 +142,7 @@ def test_a_repeated_certification_has_new_episodes_and_all_are_listed(finished):
     assert not np.array_equal(first.episodes.return_E, last.episodes.return_E)
     assert (table["episodes"] == 40).all()
     elites = run.elites()[1].values()
-    different = {elite.centre_D.tobytes() for elite in elites} | {run.policy("best").parameters_D.tobytes()}
+    different = {elite.parameters_D.tobytes() for elite in elites} | {run.policy("best").parameters_D.tobytes()}
     assert len(different) == len(elites), "the best centre is an elite"
     assert (table["candidates"] == min(5, len(elites))).all()
 
@@ -146,7 +150,7 @@ def test_a_repeated_certification_has_new_episodes_and_all_are_listed(finished):
 def test_the_certified_policy_is_the_first_of_the_newest_selection(finished):
     run, _ = finished
     newest = next(one for one in certified_policies(run.folder) if (one.number, one.rank) == (1, 0))
-    np.testing.assert_array_equal(run.policy("certified").parameters_D, newest.parameters_D)
+    np.testing.assert_array_equal(run.policy("certified").parameters_D, newest.policy.parameters_D)
 
 
 def test_it_changes_no_digest_and_a_fork_has_none(finished, tmp_path):
@@ -202,6 +206,42 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
     again = certify_run(tmp_path / "run", top=5, episodes=40)
     assert [one.number for one in again] == [2]
     assert not any(one.differences for one in recomputed_certifications(damaged))
+
+
+def test_a_certified_policy_is_stored_once_under_its_name(finished):
+    run, _ = finished
+    certified = certified_policies(run.folder)
+    with database(run.folder / "run.db") as connection:
+        stored = [name for (name,) in connection.execute("SELECT name FROM content")]
+        sizes = [len(payload) for (payload,) in connection.execute("SELECT payload FROM certification")]
+    for one in certified:
+        assert stored.count(one.policy.name) == 1
+        assert one.policy.spec == run.policy_spec
+    assert {one.policy.name for one in certified} <= {elite.name for elite in run.elites()[1].values()}
+    assert max(sizes) - min(sizes) < 64, "each has as many episodes, and only the name of its policy"
+
+
+def test_the_certified_policies_of_a_run_of_version_0_27_have_no_names_and_are_read(finished, tmp_path):
+    run, _ = finished
+    folder, before = shutil.copytree(run.folder, tmp_path / "run"), certified_policies(run.folder)
+    with database(folder / "run.db") as connection:
+        put_meta(connection, "schema_version", "8")
+        for number, rank, facts, payload in connection.execute(
+            "SELECT number, rank, facts, payload FROM certification"
+        ).fetchall():
+            arrays = decode_part(payload)
+            del arrays["policy"]
+            (one,) = (one for one in before if (one.number, one.rank) == (number, rank))
+            arrays |= {name: getattr(one.policy, name) for name in OF_POLICY}
+            connection.execute("DELETE FROM certification WHERE number = ? AND rank = ?", (number, rank))
+            row = number, rank, facts, encode_part(arrays)
+            connection.execute("INSERT INTO certification VALUES (?, ?, ?, ?, ?)", (*row, certifications._sha256(*row)))
+    after = certified_policies(folder)
+    assert [(one.row(), one.policy.name) for one in after] == [(one.row(), one.policy.name) for one in before]
+    certify_run(folder, top=5, episodes=40, keep=2)
+    with database(folder / "run.db") as connection:
+        assert get_meta(connection, "schema_version") == str(EXTENDED_SCHEMA), "an older version would delete a policy"
+    assert [one.policy.name for one in certified_policies(folder)][:4] == [one.policy.name for one in before]
 
 
 def test_another_policy_does_not_take_the_place_of_a_damaged_first(finished, tmp_path):

@@ -14,11 +14,11 @@ from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.jedi import TARGET, VISITS, is_not_dominated, predicted, promising, target_weight
 from es_service.search.algorithms.settings import settings_of
-from es_service.search.maps.behaviour_map import Elite, empty_map, insert
+from es_service.search.maps.behaviour_map import empty_map, insert
 from es_service.search.maps.geometry import Cvt, Grid, make_geometry
 from es_service.search.objectives import nearness_values
+from tests.helpers import policy_with
 
-NOTHING = np.zeros(0, np.float32)
 POINTS_N_1 = np.array([[0.1], [0.3], [0.5]])
 
 
@@ -128,7 +128,7 @@ def test_targets_change_after_their_generations_and_emitters_start_from_the_near
         nearest = [1 if abs(x - 1.5) <= abs(x - 5.5) else 5 for x, _ in state.extra[TARGET]]
         assert starts == (dict(enumerate(nearest)) if generation in (1, 4) else {})
         for emitter, cell in starts.items():
-            state = method.restart(state, emitter, cell, Elite(np.ones(6, np.float32), NOTHING, NOTHING, NOTHING))
+            state = method.restart(state, emitter, cell, policy_with(np.ones(6, np.float32)))
         asked = method.ask(state, generation)
         assert [one.objective.descriptor for one in asked] == [tuple(target) for target in targets[-1].tolist()]
         assert [one.objective.weight for one in asked] == pytest.approx([[1.0, 0.65, 0.3][(generation - 1) % 3]] * 2)

@@ -98,7 +98,7 @@ def test_twelve_generations_equal_the_reference():
     assert map_.centre_N.tolist() == [one.emitter for one in elites.values()]
     np.testing.assert_allclose(map_.fitness_N, [one.fitness for one in elites.values()], rtol=1e-6)
     for index, one in elites.items():
-        np.testing.assert_array_equal(store.elite(number(index)).centre_D, one.centre)
+        np.testing.assert_array_equal(store.elite(number(index)).parameters_D, one.centre)
     assert len(elites) > 20
     assert len(seen) > 100
     assert any(x == y for x, y in seen)

@@ -74,7 +74,7 @@ def test_thirty_generations_equal_the_reference(preset, mode):
             ours = map_.descriptor_N_B if name == "descriptor" else getattr(map_, f"{name}_N")
             np.testing.assert_allclose(ours, [getattr(elite, name) for elite in elites.values()], rtol=1e-12)
     for index, elite in elites.items():
-        assert_near(store.elite(number(index)).centre_D, elite.centre)
+        assert_near(store.elite(number(index)).parameters_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
     entered = [row["cell"] for row in store.rows if row["cell"] is not None]
     assert 31 > len(entered) > len(elites) >= 8  # some entered no cell, some one that had an elite
@@ -96,7 +96,7 @@ def test_a_block_starts_from_its_elite_and_goes_on_from_wherever_it_comes():
         row, before = store.rows[generation], store.after[generation - 1]
         start = points(evaluator, TrainingChunk, generation)[0].parameters_D
         if generation % BLOCK == 1:
-            np.testing.assert_array_equal(start, store.elite(row["start_cell"], before).centre_D)
+            np.testing.assert_array_equal(start, store.elite(row["start_cell"], before).parameters_D)
         else:
             assert row["start_cell"] is None
             np.testing.assert_array_equal(start, points(evaluator, EvaluationChunk, generation - 1)[0].parameters_D)
@@ -115,7 +115,7 @@ def test_the_history_names_each_elite_that_entered_and_the_store_has_it():
         point = points(evaluator, EvaluationChunk, row["generation"])[0]
         for cell in entered:
             elite = store.elite(cell, parts)
-            np.testing.assert_array_equal(elite.centre_D, point.parameters_D)
+            np.testing.assert_array_equal(elite.parameters_D, point.parameters_D)
             np.testing.assert_array_equal(elite.observation_mean_O, point.observation_mean_O)
             np.testing.assert_array_equal(elite.observation_std_O, point.observation_std_O)
             assert elite.trace_T_B.shape == (64, 2)

@@ -137,7 +137,7 @@ def test_map_elites_equals_the_reference(name):
             top = other.cells[cell][0]
             assert (map_.generation_N[row], map_.centre_N[row]) == (top.generation, top.number)
             assert map_.samples_N[row] == len(top.samples)
-            np.testing.assert_array_equal(store.elite(cell, parts).centre_D, top.parameters)
+            np.testing.assert_array_equal(store.elite(cell, parts).parameters_D, top.parameters)
     assert spoiled
     assert moved or not elites.again
     deepest = max(len(ranked) for ranked in other.cells.values())
@@ -196,7 +196,7 @@ def test_the_maps_of_emitters_equal_the_reference(algorithm, kind):
             cell: names[top.serial] for cell, top in tops.items()
         }
         for cell, top in tops.items():
-            assert store.elite(cell, parts).centre_D.tolist() == top.parameters
+            assert store.elite(cell, parts).parameters_D.tolist() == top.parameters
         for index, centre in enumerate(centres):
             mine = [cell for cell, top in tops.items() if (top.generation, top.number) == (generation, index)]
             assert centre["cell"] == (mine[0] if mine else -1)

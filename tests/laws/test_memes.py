@@ -20,10 +20,11 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import TRIED, Starts, drawn_cell, first_state, start_shares
 from es_service.search.algorithms.memes import AGE, RESET_CHOICE, STAGNANT
-from es_service.search.maps.behaviour_map import Elite, empty_map, insert
+from es_service.search.maps.behaviour_map import empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.search.novelty import empty_archive, extended
 from es_service.store.codec import decode_part, encode_part
+from tests.helpers import policy_with
 from tests.laws import me_es_runs
 from tests.laws.me_es_runs import (
     CELLS,
@@ -88,7 +89,7 @@ def test_twenty_four_generations_equal_the_reference(mode):
     map_ = state.search.map
     assert map_.cell_N.tolist() == [number(index) for index in elites]
     for index, elite in elites.items():
-        assert_near(store.elite(number(index)).centre_D, elite.centre)
+        assert_near(store.elite(number(index)).parameters_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
     assert state.search.archive.size == 25 * EMITTERS > NEWEST, "the archive itself stays whole"
     assert len(resets) >= 5
@@ -125,8 +126,7 @@ def test_an_emitter_is_reset_after_generations_in_which_nothing_of_its_entered_t
         ]
     ):
         for emitter in search.start_cells(state, generation):
-            nothing = np.zeros(0, np.float32)
-            state = search.restart(state, emitter, 3, Elite(np.ones(3, np.float32), nothing, nothing, nothing))
+            state = search.restart(state, emitter, 3, policy_with(np.ones(3, np.float32)))
         told = tuple(
             evaluated(generation, emitter, *(of or (0.0, np.nan)), valid=of is not None)
             for emitter, of in enumerate((first, second))
@@ -141,8 +141,7 @@ def test_an_emitter_begins_again_with_a_fresh_optimiser_and_a_count_of_its_own()
     state = replace(state, extra={STAGNANT: np.array([5, 7, 1])})
     used = replace(state.centres[1], step={"adam_step": np.array(9), "adam_m_D": np.ones(3, np.float32)})
     state = replace(state, centres=(state.centres[0], used, state.centres[2]))
-    nothing = np.zeros(0, np.float32)
-    after = search.restart(state, 1, 4, Elite(np.full(3, 2, np.float32), nothing, nothing, nothing))
+    after = search.restart(state, 1, 4, policy_with(np.full(3, 2, np.float32)))
     assert after.extra[STAGNANT].tolist() == [5, 0, 1]
     assert (after.centres[1].step["adam_step"], after.centres[1].cell) == (0, 4)
     assert after.centres[1].step["adam_m_D"].tolist() == [0, 0, 0]
@@ -239,8 +238,7 @@ def test_an_emitter_that_exploits_begins_again_after_its_generations_although_it
     ages = []
     for generation in range(8):
         for emitter in (reset := search.start_cells(state, generation)):
-            nothing = np.zeros(0, np.float32)
-            state = search.restart(state, emitter, 3, Elite(np.ones(3, np.float32), nothing, nothing, nothing))
+            state = search.restart(state, emitter, 3, policy_with(np.ones(3, np.float32)))
         ages.append((sorted(reset), state.extra[AGE].tolist()))
         state = told(search, state, generation, (1.5, 5.5))  # each generation is fitter than the one before
     assert ages == [
@@ -278,8 +276,7 @@ def test_starts_are_drawn_in_these_proportions():
 def test_starts_are_counted_where_the_least_tried_is_wanted():
     search, state = begun(starts="least_tried", stagnation_generations=1)
     state = told(search, state, 0, (1.5, 5.5))
-    nothing = np.zeros(0, np.float32)
-    elite, drawn = Elite(np.ones(3, np.float32), nothing, nothing, nothing), []
+    elite, drawn = policy_with(np.ones(3, np.float32)), []
     for generation in range(1, 5):
         state = told(search, state, -generation, (1.5, 5.5))  # nothing is fitter than before
         for emitter, cell in search.start_cells(state, generation).items():

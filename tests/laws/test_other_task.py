@@ -41,7 +41,7 @@ from es_service.runs.view import open_run
 from es_service.watch.pages import draw_list, metrics
 from es_service.watch.runs import Runs
 from tests.database import database
-from tests.helpers import DirectEvaluator
+from tests.helpers import DirectEvaluator, policy_with
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
@@ -76,10 +76,10 @@ def copied(finished, tmp_path):
 
 def returns_of(config, policy, episodes, number, seed) -> np.ndarray:
     """Returns of episodes of one policy, computed apart from any engine."""
-    task, (parameters_D, mean_O, std_O) = task_of(config), (x[None] for x in policy)
+    task, statistics = task_of(config), (policy.observation_mean_O[None], policy.observation_std_O[None])
     direct = DirectEvaluator(worker_spec(config, task))
     address = {"seed": seed, "generation": number, "domain": Domain.OTHER_TASK_RESET}
-    asked = policy_work(parameters_D, (mean_O, std_O), episodes, **address)
+    asked = policy_work(policy.parameters_D[None], statistics, episodes, **address)
     answers = [one for one in direct.evaluate(asked.work) if isinstance(one, EpisodesResult)]
     return gathered([asked.shape], answers)[0].returns[0]
 
@@ -244,7 +244,7 @@ def test_every_reader_shows_the_other_tasks(copied, tmp_path):
     [replay] = record(copied, best=False, cells=[], certified=True)[0]
     assert replay.is_the_stored, "its address is that of the certification in two tasks"
     newest = next(one for one in certified_policies(copied.folder) if (one.number, one.rank) == (3, 0))
-    np.testing.assert_array_equal(copied.policy("certified").parameters_D, newest.parameters_D)
+    np.testing.assert_array_equal(copied.policy("certified").parameters_D, newest.policy.parameters_D)
 
 
 def test_a_comparison_shows_the_values_there_and_the_gaps(copied, tmp_path):
@@ -354,8 +354,9 @@ def test_a_policy_that_is_invalid_in_all_episodes_of_another_task_has_no_numbers
         ones = np.ones(4)
         return Episodes(value * ones, value * ones, np.nan * ones, None, ones.astype(np.int64), ones[:, None])
 
-    there, arrays = Elsewhere("point_maze", {}, None, "xla", True, episodes(np.nan)), [np.zeros(1, np.float32)] * 3
-    policy = Certified(0, 0, "best", 1, 1.0, "return", 1.0, 16, 2, 3, False, 0, {}, episodes(1.0), *arrays, there)
+    there = Elsewhere("point_maze", {}, None, "xla", True, episodes(np.nan))
+    itself = policy_with(np.zeros(1, np.float32))
+    policy = Certified(0, 0, "best", 1, 1.0, "return", 1.0, 16, 2, 3, False, 0, {}, episodes(1.0), itself, there)
     row = policy.row()
     assert np.isnan([row["elsewhere_return_mean"], row["gap_return_mean"], row["gap_last_reward_low"]]).all()
     assert row["gap_goal_distance_mean"] is None

@@ -118,7 +118,7 @@ def test_an_elite_that_was_a_policy_has_its_parameters_statistics_and_trace(fini
         elite = store.elite(cell)
         ask, number = (0, centre - 2) if centre < 20 else (1, centre - 20)
         policies = (POLICIES + np.float32(generation), OTHERS)[ask]
-        np.testing.assert_array_equal(elite.centre_D, policies[number])
+        np.testing.assert_array_equal(elite.parameters_D, policies[number])
         mean, std = (no_statistics(18, 2), (MEAN, STD))[ask]
         np.testing.assert_array_equal(elite.observation_mean_O, mean[number])
         np.testing.assert_array_equal(elite.observation_std_O, std[number])

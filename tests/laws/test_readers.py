@@ -112,7 +112,7 @@ def test_every_policy_is_the_one_that_was_evaluated(run):
     for which in ("best", *places(run)):
         assert np.abs(run.policy(which)(observation)).max() <= 1.0
     elite = run.elite(places(run)[-1])
-    np.testing.assert_array_equal(run.policy(places(run)[-1]).parameters_D, elite.centre_D)
+    np.testing.assert_array_equal(run.policy(places(run)[-1]).parameters_D, elite.parameters_D)
     if updates_centres(run):
         rows = run.evaluations.query("generation == @GENERATIONS and centre < @run.constants['search.centres']")
         fittest = int(rows.loc[rows["fitness_mean"].idxmax(), "centre"])

@@ -73,9 +73,9 @@ def test_the_driver_makes_a_policy_with_the_bits_that_a_worker_makes():
     asked = recipes(20)
     work = policy_work(asked, no_statistics(20, 2), 1, seed=0, generation=1)
     theirs = np.concatenate([subject.parameters_N_D.made() for subject, _ in work.work])
-    for number, centre in zip([3, 19, 3, 0], work.policies([3, 19, 3, 0]), strict=True):
-        assert bits(centre.parameters_D) == bits(theirs[number])
-    assert bits(work.policies([7])[0].parameters_D) == bits(theirs[7])
+    for number, policy in zip([3, 19, 3, 0], work.policies([3, 19, 3, 0], SHAPE), strict=True):
+        assert bits(policy.parameters_D) == bits(theirs[number])
+    assert bits(work.policies([7], SHAPE)[0].parameters_D) == bits(theirs[7])
 
 
 def test_a_name_is_that_of_the_content():
@@ -199,7 +199,7 @@ def test_what_a_sender_does_not_know_of_is_forgotten_first():
 
 def born(work, number, origins):
     """One of the policies that are asked for, whose origin is then known."""
-    parameters_D = work.policies([number])[0].parameters_D
+    parameters_D = work.policies([number], SHAPE)[0].parameters_D
     origins |= work.parameters_N_D.part([number]).origins_of([name_of(parameters_D)])
     return parameters_D
 

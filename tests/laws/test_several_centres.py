@@ -83,7 +83,7 @@ def test_blocks_side_by_side_equal_the_reference(preset):
         for ours, name in ((map_.fitness_N, "fitness"), (map_.score_N, "score"), (map_.descriptor_N_B, "descriptor")):
             np.testing.assert_allclose(ours, [getattr(elite, name) for elite in elites.values()], rtol=1e-12)
     for index, elite in elites.items():
-        assert_near(store.elite(number(index, CELLS)).centre_D, elite.centre)
+        assert_near(store.elite(number(index, CELLS)).parameters_D, elite.centre)
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, archive, rtol=1e-12)
     assert shared >= 1, "some blocks began from the same elite"
     assert robbed >= 1, "an elite was replaced while a block that led from it was to be told"

@@ -42,7 +42,7 @@ def test_exports_hold_what_the_run_holds(tmp_path, mapped):
         np.testing.assert_array_equal(arrays["fitness"], mapped.map["fitness"])
         np.testing.assert_array_equal(arrays["best_parameters"], mapped.policy("best").parameters_D)
         elite = mapped.elite(arrays["cell"][3])
-        np.testing.assert_array_equal(arrays["parameters"][3], elite.centre_D)
+        np.testing.assert_array_equal(arrays["parameters"][3], elite.parameters_D)
         np.testing.assert_array_equal(arrays["trace"][3], elite.trace_T_B)
     result = command("export", mapped.folder, "--to", "pdf")
     assert result.returncode == 2

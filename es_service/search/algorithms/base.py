@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.parts import Objective
+from es_service.protocol.content import Policy
 from es_service.protocol.episodes import part_of
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.recipes import Recipes
 from es_service.search.arrays import freeze, read_only
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite
+from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, sound_archive
 from es_service.search.steps import StepState, restarted
 
@@ -92,7 +93,7 @@ def frozen(state: SearchState) -> SearchState:
 
 
 def from_elite(
-    state: SearchState, index: int, cell: int, elite: Elite, *, elite_statistics: bool = False
+    state: SearchState, index: int, cell: int, elite: Policy, *, elite_statistics: bool = False
 ) -> SearchState:
     """The state in which an elite replaces a centre, whose step begins anew.
 
@@ -104,7 +105,7 @@ def from_elite(
     """
     before = state.centres[index]
     centre = CentreState(
-        elite.centre_D,
+        elite.parameters_D,
         restarted(before.step),
         before.entry,
         cell,
@@ -253,7 +254,7 @@ class Algorithm:
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
     """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
     other centres continue."""
-    restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
+    restart: Callable[[SearchState, int, int, Policy], SearchState] = from_elite
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
     extra: Mapping[str, Any] = field(default_factory=dict)
     """What else the search remembers, by name, at first: arrays, and mappings of such (`search.arrays`)."""

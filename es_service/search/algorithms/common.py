@@ -17,6 +17,7 @@ from es_service.config.model import RunConfig
 from es_service.config.parts import Objective
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.sections import NoveltyConfig
+from es_service.protocol.content import Policy
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
@@ -32,7 +33,7 @@ from es_service.search.algorithms.base import (
 )
 from es_service.search.algorithms.settings import CentresSettings, settings_of
 from es_service.search.arrays import read_only
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite, changed, insert
+from es_service.search.maps.behaviour_map import BehaviourMap, changed, insert
 from es_service.search.maps.geometry import cell_count
 from es_service.search.novelty import NoveltyArchive, empty_archive, extended, novelty
 from es_service.search.objectives import utilities, weight_of_fitness, weighted
@@ -221,7 +222,7 @@ def insert_into_map(state: SearchState, evaluation: CentreEvaluation) -> SearchS
 
 
 Starts = Literal["uniform", "novelty", "least_tried", "fitness"]
-Restart = Callable[[SearchState, int, int, Elite], SearchState]
+Restart = Callable[[SearchState, int, int, Policy], SearchState]
 TRIED = "tried"
 """Name of an array of the search's own [cells]: number of centres that have begun from each cell."""
 
@@ -234,7 +235,7 @@ def counted_starts(config: RunConfig) -> dict[str, NDArray[np.int64]]:
 def counting(restart: Restart) -> Restart:
     """The same function, which also counts the start if the search counts them."""
 
-    def counted(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
+    def counted(state: SearchState, index: int, cell: int, elite: Policy) -> SearchState:
         if (tried_C := state.extra.get(TRIED)) is not None:
             tried_C = tried_C + (np.arange(tried_C.size) == cell)
             state = replace(state, extra=read_only({**state.extra, TRIED: tried_C}))

@@ -26,6 +26,7 @@ from pydantic import Field
 from es_service.config.model import RunConfig
 from es_service.config.parts import Count, FitnessObjective, NoveltyObjective, Objective
 from es_service.config.search import same
+from es_service.protocol.content import Policy
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
     NO_CELL,
@@ -49,7 +50,6 @@ from es_service.search.algorithms.common import (
 from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
-from es_service.search.maps.behaviour_map import Elite
 from es_service.search.objectives import weight_of_fitness
 
 RESET_CHOICE = 4
@@ -114,7 +114,7 @@ def memes(config: RunConfig) -> Algorithm:
             int(emitter): drawn_cell(state.map, share_N, drawn_M[emitter]) for emitter in np.flatnonzero(is_reset_M)
         }
 
-    def restart(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
+    def restart(state: SearchState, index: int, cell: int, elite: Policy) -> SearchState:
         counts = {name: counts_M for name, counts_M in state.extra.items() if name in (STAGNANT, AGE)}
         zeroed = {name: np.where(np.arange(counts_M.size) == index, 0, counts_M) for name, counts_M in counts.items()}
         return elite_restart(replace(state, extra=read_only({**state.extra, **zeroed})), index, cell, elite)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.content import NAME
+from es_service.protocol.content import NAME, Policy
 from es_service.protocol.messages import FloatArray
 from es_service.search.maps.geometry import Geometry
 
@@ -81,19 +81,11 @@ class BehaviourMap:
         return np.where(is_there_Q, np.append(self.cell_N[rows], EMPTY)[found_Q], EMPTY)
 
 
-NO_TRACE = np.zeros((0, 0), np.float32)
-"""Stands for the trace of an elite where nobody needs it."""
-
-
-@dataclass(frozen=True)
-class Elite:
+@dataclass(frozen=True, eq=False)
+class Elite(Policy):
     """The elite of a cell: the policy and the trace that its entry names."""
 
-    centre_D: FloatArray
-    observation_mean_O: FloatArray
-    observation_std_O: FloatArray
-    """Mean and standard deviation of observations with which it was evaluated."""
-    trace_T_B: FloatArray = field(default_factory=lambda: NO_TRACE)
+    trace_T_B: FloatArray = field(repr=False)
     """Descriptor along one evaluation episode, from reset to end at equal intervals."""
 
 
