@@ -32,7 +32,7 @@ from es_service.config.keys import (
 from es_service.config.model import Kept, Made, RunConfig, nested, replaces
 from es_service.config.parts import TASK_OPTIONS, as_tuple
 from es_service.config.resolution import Unknown, Values, asks
-from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of
+from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of, unknown_output
 from es_service.config.search import SearchConfig, preset_rows
 from es_service.config.tasks import CHOICES, OTHER_TASKS, Tasks, read_options, settings_of_task
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
@@ -89,6 +89,8 @@ class Reading:
             values["search.init_from"] = given["search.init_from"] = os.path.abspath(given_path(start))
         sections = nested(values, SECTIONS)
         config = RunConfig.model_validate(sections | {"search": self.settings.model_validate(sections["search"])})
+        if problem := unknown_output(config.search, self.task):
+            raise ConfigError.listing(f"{self.name}: 1 problem", [problem])
         return config.made_of(Made(self.values.task, given, self.left_out, self.kept))
 
     @cached_property

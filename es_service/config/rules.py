@@ -17,10 +17,12 @@ from es_service.config.given import start_of
 from es_service.config.keys import BUDGET, FIELDS
 from es_service.config.parts import LARGEST, RESOURCES, TASK_OPTIONS, counts
 from es_service.config.resolution import Unknown, Values, only_centres
+from es_service.config.search import SearchConfig
 from es_service.config.tasks import CALLER, is_start
 from es_service.config.text import not_allowed, one_of, problem_of, show, wrong_value
 from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.outputs import AT_THE_END, METRICS
 from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS
 from es_service.protocol.rollouts import CHUNK_PAIRS
 
@@ -273,6 +275,17 @@ def statistics_need_training(config: Values, task: TaskSpec) -> Problems:
     if not config.settings.gathers_statistics and config["policy.observation_normalization"] is True:
         why = f" for {config['search.algorithm']}, which has no training episodes to gather statistics from"
         yield not_allowed("policy.observation_normalization", True, "false", why=why)
+
+
+def unknown_output(search: SearchConfig, task: TaskSpec) -> Problem | None:
+    """The problem of a search, a user's perhaps, that reads an output of episodes that there is not."""
+    has = {"success": bool(task.success), METRICS: bool(task.metric_names)}
+    known = [name for name in sorted(AT_THE_END) if has.get(name, True)]
+    unknown = sorted({*search.outputs()} - {*known})
+    if not unknown:
+        return None
+    what = f"{search.algorithm} reads the output {unknown[0]!r}, which no episode of {task.name} has"
+    return Problem(f"search.algorithm: {what}; choose {one_of(known)}", "search.algorithm", unknown[0], one_of(known))
 
 
 def method_has_its_map(config: Values, task: TaskSpec) -> Problems:

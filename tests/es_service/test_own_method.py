@@ -88,6 +88,16 @@ def test_a_metric_has_the_name_of_a_column(tmp_path):
         api.run(api.load_config(CONFIG), tmp_path / "run")
 
 
+@pytest.mark.parametrize("reads", ["'last_action',", "'last_reward', 'height'"])
+def test_an_output_of_episodes_that_there_is_not_is_refused_before_a_run_begins(tmp_path, reads):
+    declared = f"only_centres: ClassVar = 1\n    outputs = lambda self: ({reads})\n"
+    (tmp_path / "restless_method.py").write_text(METHOD.replace("only_centres: ClassVar = 1\n", declared))
+    what = r"restless_method:restless reads the output '(last_action|height)', which no episode of point_maze has"
+    choices = "choose first_observation, last_observation, last_reward or success"
+    with pytest.raises(ConfigError, match=rf"search\.algorithm: {what}; {choices}"):
+        api.load_config(CONFIG)
+
+
 def test_its_runs_are_resumed_forked_verified_reported_and_exported(tmp_path, capsys):
     whole = api.run(api.load_config(CONFIG), tmp_path / "whole").run
     assert (restarts(whole), whole.constants["search.patience"]) == (2, 3)
