@@ -111,7 +111,7 @@ OUTPUTS: Mapping[str, EpisodeOutput] = {
     "step_descriptor": _of_state(lambda environment, state: jnp.asarray(environment.descriptor(state), jnp.float32)),
 }
 """All outputs by name."""
-assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/outputs.py has its functions here"
 
 
 class Carry(NamedTuple):

@@ -72,7 +72,7 @@ OUTPUTS: Mapping[str, HostOutput] = {
     ),
 }
 """All outputs by name."""
-assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/outputs.py has its functions here"
 
 
 class Outputs:
