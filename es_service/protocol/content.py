@@ -54,8 +54,7 @@ def names_in(arrays: Arrays) -> frozenset[bytes]:
 
 def as_bytes(name_N: NDArray[Any]) -> list[bytes]:
     """The names of an array of names, as bytes."""
-    flat = name_N.tobytes()
-    return [flat[first : first + NAME.itemsize] for first in range(0, len(flat), NAME.itemsize)]
+    return name_N.reshape(-1).tolist()
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,8 +156,14 @@ class KeptStates:
         """`rows`: all intact rows that are stored; `named`: what they and those of certified policies name; `newest`:
         newest generation, None if there is none."""
         self._rows, self._named = rows, dict(named)
-        self._count = Counter(name for names in named.values() for name in names)
-        """Number of rows that name each content."""
+        self._count = Counter[bytes]()
+        """By name of a content, in how many runs of successive rows of a part it is named: 0 if nothing names it. A new
+        row names nearly the same as the one before, so few of these numbers change with it."""
+        before: tuple[str, frozenset[bytes]] = "", frozenset()
+        for part, at in sorted({*self._named, *((part, at) for part, of_part in rows.items() for at in of_part)}):
+            names = self._named_by(part, at)
+            self._count.update(names - (before[1] if before[0] == part else frozenset()))
+            before = part, names
         self.total = 0 if newest is None else state_sum(rows_in_force(rows, newest))
         """`codec.state_sum` of the newest state."""
         # Parts of which an older row is stored as well, which the generation before the newest needs.
@@ -208,17 +214,20 @@ class KeptStates:
         added = [name for name in change if name not in self._count]
         return added, [name for name, by in change.items() if self._count[name] + by == 0]
 
+    def _named_by(self, part: str, at: int | None) -> frozenset[bytes]:
+        return frozenset() if at is None else self._named.get((part, at), frozenset())
+
     def _change(self, named: Named, outdated: Iterable[tuple[str, int]]) -> Counter[bytes]:
-        """By how much the number of rows that name each content changes, where it may change; arguments as of
-        `named_after`."""
+        """By how much `_count` changes with a commit, where it may change; arguments as of `named_after`."""
         change = Counter[bytes]()
-        going = {part: names for part, at in outdated if (names := self._named.get((part, at)))}
-        for (part, _), names in named.items():  # most of them are also in the older row of the part
-            before = going.pop(part, frozenset())
-            change.update(names - before)
-            change.subtract(before - names)
-        for names in going.values():
-            change.subtract(names)
+        for (part, _), names in named.items():
+            change.update(names - self._named_by(part, max(self._rows.get(part, ()), default=None)))
+        for part, at in outdated:
+            rows = self._rows[part]
+            earlier = self._named_by(part, max((row for row in rows if row < at), default=None))
+            later = self._named_by(part, min((row for row in rows if row > at), default=None))
+            names = self._named_by(part, at)
+            change.subtract((names - earlier - later) | ((earlier & later) - names))
         return change
 
     def add_named(self, named: Named, outdated: Iterable[tuple[str, int]] = ()) -> None:
