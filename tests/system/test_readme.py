@@ -223,6 +223,13 @@ def long_cells(text: str) -> list[str]:
     return [cell.strip() for row in rows for cell in row.split(" | ") if len(cell.strip()) > 160]
 
 
+def test_long_sentences_and_cells_are_seen():
+    long, short = (f"Word{' word' * count}." for count in (35, 34))
+    text = f"# Title\n\n{short} {short}\n`key` is one word. {short}\n\n- {long}\n\n```text\n{long}\n```\n\n1. {long}\n"
+    assert long_sentences(text) == [f"- {long}", long]
+    assert long_cells(f"| a | {'x' * 161} |\n| [{'x' * 158}](address) | b |\n") == ["x" * 161]
+
+
 @pytest.mark.parametrize("guide", MOST)
 def test_a_tired_reader_can_read_it(guide):
     text, (lines, sentences, cells) = TEXT[guide], MOST[guide]
