@@ -33,7 +33,7 @@ RUNS_FOLDER = Path("runs")
 
 
 def _draw_for_notebook(run: Run) -> str:
-    from es_service.report.notebook import run_html  # takes time that other programs need not spend
+    from es_service.report.write import run_html  # takes time that other programs need not spend
 
     return run_html(run)
 

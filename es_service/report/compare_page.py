@@ -10,12 +10,11 @@ import numpy as np
 from es_service.errors import NotInRunError, counted
 from es_service.report import between, compare, maps
 from es_service.report.bootstrap import WHOLE_RANGE, coverage
-from es_service.report.colours import value_range
 from es_service.report.compare import Group, Quartiles, Summary
 from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
 from es_service.report.facts import number
-from es_service.report.markup import Markup, joined, table, tag
+from es_service.report.markup import Markup, joined, table, tag, value_range
 from es_service.report.measures import CERTIFIED, measure_named, measures
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES

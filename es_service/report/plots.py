@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.system import given_path
-from es_service.report import between, compare, several_maps, statistics
-from es_service.report.colours import value_range
+from es_service.report import between, compare, maps, statistics
 from es_service.report.data import RunData, read_run
-from es_service.report.detours import detours
-from es_service.report.floor import beside_walls, is_plan
-from es_service.report.markup import tick_text
+from es_service.report.floor import beside_walls, detours, is_plan
+from es_service.report.markup import tick_text, value_range
 from es_service.report.measures import measure_named
 from es_service.report.series import X_AXES, lone
 from es_service.runs.view import Run
@@ -118,7 +116,7 @@ def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None)
 def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
     """Draw the path of an elite's first evaluation episode: a line through the points that the run stored.
 
-    Where a wall is between two of them, the shortest way round it is dashed; see `es_service.report.detours`.
+    Where a wall is between two of them, the shortest way round it is dashed; see `es_service.report.floor`.
 
     Args:
         cell: place of the elite's cell; None: that of the fittest elite.
@@ -233,7 +231,7 @@ def archive_profile(runs: Source | Several, axes: Axes, group_by: Sequence[str] 
     low, high = value_range(np.concatenate([data.map.fitness_N for data in all_data if data.map is not None]))
     fitness_K = np.linspace(low, high, compare.POINTS)
     for index, group in enumerate(groups):
-        share_R_K = np.stack([several_maps.profile(run.map, fitness_K) for run in group.runs if run.map is not None])
+        share_R_K = np.stack([maps.profile(run.map, fitness_K) for run in group.runs if run.map is not None])
         axes.plot(fitness_K, np.median(share_R_K, axis=0), label=group.name, **_style(index))
         if (interval_2_K := group.interval(share_R_K)) is not None:
             axes.fill_between(fitness_K, *interval_2_K, color=_style(index)["color"], alpha=0.18, linewidth=0)
@@ -260,7 +258,7 @@ def snapshots(run: Source, figure: Any, count: int = 4) -> Any:
     panels = figure.subplots(1, count, squeeze=False, sharey=True).ravel()
     for k, axes in enumerate(panels):
         row = int(np.searchsorted(steps_G, steps_G[-1] * (k + 1) / count))
-        shown = data if k == count - 1 else several_maps.until(data, int(generation_G[row]))
+        shown = data if k == count - 1 else maps.until(data, int(generation_G[row]))
         drawn = behaviour_map(shown, axes, colours)
         axes.set_title(f"{tick_text(float(steps_G[row]), 1.0)} steps", fontsize=9)
         axes.label_outer()

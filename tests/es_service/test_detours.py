@@ -11,8 +11,7 @@ from es_service import api, plots
 from es_service.protocol.messages import TRACE_POINTS
 from es_service.report import maps
 from es_service.report.data import read_run
-from es_service.report.detours import crosses, detours
-from es_service.report.floor import plan_frame
+from es_service.report.floor import crosses, detours, plan_frame
 from es_service.runs.snapshot import acting
 from tests.references import point_maze
 from workers.environments import SHIPPED

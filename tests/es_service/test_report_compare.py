@@ -11,13 +11,13 @@ import pytest
 from es_service import open_run, plots
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.options import choice
-from es_service.report import compare, figures, several_maps
+from es_service.report import compare, figures
+from es_service.report import maps as several_maps
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
 from es_service.report.facts import number
-from es_service.report.figures import empty_figure, write_figures
+from es_service.report.figures import draw_overview, empty_figure, write_figures
 from es_service.report.floor import beside_walls
-from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
 from es_service.runs.folders import GROUPS, INSIDE, write_groups
 from es_service.search.maps.behaviour_map import BehaviourMap

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from es_service.cli.main import app
 from es_service.errors import StoreError
 from es_service.protocol.machine import CODE, code_text
-from es_service.report import facts, series, settings
+from es_service.report import facts, series
 from es_service.report.data import read_run
 from es_service.runs.view import open_run
 from es_service.store.sound import read_sound
@@ -42,14 +42,14 @@ def test_a_report_reads_what_other_readers_read(folder):
 
 def test_settings_are_shown_if_they_differ_and_not_if_they_follow(folder):
     """search.pairs changes the chunks, too; task, algorithm, seed and budget are shown elsewhere."""
-    found = settings.changed_settings(open_run(folder).config, POINT)
+    found = facts.changed_settings(open_run(folder).config, POINT)
     assert [tuple(one) for one in found] == [("search.pairs", "64", "512"), ("search.sigma", "0.3", "0.02")]
 
 
 def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
     wanted = {"task.options.start": "corner", "search.preset": "uber", "map.enabled": False, "search.algorithm": "es"}
     config = open_run(write_run(tmp_path / "run", wanted)).config
-    found = {one.key: (one.value, one.default) for one in settings.changed_settings(config, POINT)}
+    found = {one.key: (one.value, one.default) for one in facts.changed_settings(config, POINT)}
     assert found == {
         "task.options.start": ("corner", "default"),
         "search.preset": ("uber", "literature"),
@@ -60,13 +60,13 @@ def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
 def test_a_key_of_another_kind_of_part_has_its_own_default(tmp_path):
     wanted = {"search.shaping.kind": "top_pairs", "search.shaping.count": 2, "search.algorithm": "es"}
     config = open_run(write_run(tmp_path / "run", wanted)).config
-    found = {one.key: (one.value, one.default) for one in settings.changed_settings(config, POINT)}
+    found = {one.key: (one.value, one.default) for one in facts.changed_settings(config, POINT)}
     assert found == {"search.shaping.kind": ("top_pairs", "ranks"), "search.shaping.count": ("2", "null")}
 
 
 def test_all_settings_are_shown_if_the_defaults_are_unknown(folder):
     config = open_run(folder).config
-    found = settings.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
+    found = facts.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
     assert {"search.forgotten", "search.step.l2"} <= {one.key for one in found}
     assert {one.default for one in found} == {""}
 

@@ -17,9 +17,8 @@ from es_service.cli.printing import error_message
 from es_service.errors import StoreError
 from es_service.protocol.options import choice
 from es_service.report import floor, maps
-from es_service.report.colours import LEVELS, SCALE, level
 from es_service.report.data import read_run
-from es_service.report.markup import Frame, Markup, data_script, tag, tick_text, ticks
+from es_service.report.markup import LEVELS, SCALE, Frame, Markup, data_script, level, tag, tick_text, ticks
 from es_service.report.page import run_page
 from es_service.report.write import python_call, write_report
 from tests.database import execute
