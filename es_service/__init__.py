@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
     from es_service.runs.certification import certify, certify_run
-    from es_service.runs.polishing import polish_config
+    from es_service.runs.lineage import polish_config
     from es_service.runs.sweep import sweep
 
     __version__: str
@@ -44,7 +44,7 @@ _MODULES = {
     "ask_tell": "es_service.asking",
     "certify": "es_service.runs.certification",
     "certify_run": "es_service.runs.certification",
-    "polish_config": "es_service.runs.polishing",
+    "polish_config": "es_service.runs.lineage",
     "sweep": "es_service.runs.sweep",
     "write_comparison": "es_service.report.write",
     "write_report": "es_service.report.write",

@@ -16,7 +16,7 @@ import gymnasium
 
 from workers.environments import SHIPPED
 
-SINGLE = "es_service.environments.single:TaskEnv"
+SINGLE = "es_service.environments.vector:TaskEnv"
 VECTOR = "es_service.environments.vector:TaskVectorEnv"
 
 

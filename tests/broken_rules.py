@@ -699,7 +699,7 @@ CASES = [
         "tests/es_service/test_targets.py",
         (
             "is that of the episodes that decided",
-            "es_service/runs/targets.py",
+            "es_service/runs/sessions.py",
             "episodes=episodes_of(decision.policy, number, Domain.CERTIFICATION_RESET),",
             "episodes=decision.episodes,",
         ),

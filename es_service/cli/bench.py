@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from es_service.cli.options import ConfigArgument, LinesOption, SetOption, overrides
-from es_service.cli.printing import print_json_line
+from es_service.cli.common import ConfigArgument, LinesOption, SetOption, overrides, print_json_line
 from es_service.config.given import Overrides, parse_overrides
 from es_service.config.parts import TASK_OPTIONS
 from es_service.config.resolution import options_of

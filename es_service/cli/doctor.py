@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from es_service.api import load_config
-from es_service.cli.printing import print_finding, print_json
+from es_service.cli.common import print_finding, print_json
 from es_service.config.tasks import TASKS
 from es_service.config.text import did_you_mean_task, one_of
 from es_service.config.workload import worker_spec

@@ -15,18 +15,23 @@ import typer
 from rich.console import Console
 
 from es_service import api
-from es_service.cli.options import (
+from es_service.cli.common import (
     JsonOption,
     LogLevelOption,
     RunsArgument,
     ShowOutputOption,
+    console,
+    errors,
     is_single,
     items_of_each,
     of_each,
+    output_shown,
     place_of,
+    print_json,
+    print_line,
+    print_note,
     readable,
 )
-from es_service.cli.printing import console, errors, output_shown, print_json, print_line, print_note
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.system import given_path
 from es_service.report.progress import print_notice

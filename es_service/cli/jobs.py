@@ -11,16 +11,19 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
-from es_service.cli.options import (
+from es_service.cli.common import (
     ConfigArgument,
     JsonOption,
     LinesOption,
     SeedOption,
     SetOption,
     WorkersOption,
+    command,
     overrides,
+    print_json,
+    print_json_line,
+    print_note,
 )
-from es_service.cli.printing import command, print_json, print_json_line, print_note
 from es_service.cli.sweep import GridOption, ParallelOption, SeedsOption, grid_of, seeds_of
 from es_service.config.given import parse_overrides, read_config
 from es_service.errors import ConfigError

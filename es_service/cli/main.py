@@ -22,10 +22,7 @@ import typer
 
 from es_service import api
 from es_service.cli.bench import bench
-from es_service.cli.evaluate import evaluate
-from es_service.cli.guides import help_
-from es_service.cli.jobs import job_commands
-from es_service.cli.options import (
+from es_service.cli.common import (
     AddressOption,
     ConfigArgument,
     EngineOption,
@@ -41,14 +38,18 @@ from es_service.cli.options import (
     ShowOutputOption,
     StrictOption,
     WorkersOption,
+    console,
     overrides,
+    print_config_notes,
+    print_error,
+    print_line,
 )
-from es_service.cli.printing import console, print_config_notes, print_error, print_line
+from es_service.cli.evaluate import evaluate
+from es_service.cli.jobs import job_commands
 from es_service.cli.report import export, report, watch
-from es_service.cli.session import polish, session, told_to_user
-from es_service.cli.show import config_, digest_, list_, status
+from es_service.cli.session import polish, session, told_to_user, verify
+from es_service.cli.show import config_, digest_, help_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
-from es_service.cli.verify import verify
 from es_service.config.changes import again_with
 from es_service.config.given import parse_overrides
 from es_service.config.workload import parallel_sentence

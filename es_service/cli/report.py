@@ -11,8 +11,16 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from es_service import api
-from es_service.cli.options import RunArgument, RunsArgument, is_single, of_each, place_of, readable
-from es_service.cli.printing import evaluation_of, print_note
+from es_service.cli.common import (
+    RunArgument,
+    RunsArgument,
+    evaluation_of,
+    is_single,
+    of_each,
+    place_of,
+    print_note,
+    readable,
+)
 from es_service.errors import ConfigError, WayOut
 from es_service.protocol.system import given_path
 

@@ -1,38 +1,58 @@
-"""The commands that only read and print: `status`, `digest`, `config` and `list`.
+"""The commands that only read and print: `status`, `digest`, `config` and `list`; and `help`, sections of the guides.
 
 `--json` prints the content of the tables as data.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
+from rich.markdown import Markdown
 from rich.padding import Padding
 from rich.table import Table
 
 from es_service import api
-from es_service.cli.options import JsonOption, RunsArgument, is_single, of_each, problem_data, readable
-from es_service.cli.printing import command, console, print_json, print_line, print_note
+from es_service.cli.common import (
+    JsonOption,
+    RunsArgument,
+    command,
+    console,
+    is_single,
+    of_each,
+    print_json,
+    print_line,
+    print_note,
+    problem_data,
+    readable,
+)
 from es_service.cli.status import follow_status, print_status
 from es_service.config.given import first_sentence, shipped_configs, shipped_text
 from es_service.config.keys import SECTIONS, unknown_key
 from es_service.config.search import PRESETS, preset_table
 from es_service.config.tasks import TASKS
-from es_service.config.text import show
+from es_service.config.text import did_you_mean, nearest, show
 from es_service.config.values import DescribedKey, described_keys, methods_words
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
 from es_service.protocol.system import given_path
 from es_service.report.progress import short
-from es_service.runs.folders import output_of, runs_of
-from es_service.runs.recent import Recent, read_recent
-from es_service.runs.run_status import RunStatus, newest_runs, read_status, state
+from es_service.runs.run_status import (
+    Recent,
+    RunStatus,
+    newest_runs,
+    output_of,
+    read_recent,
+    read_status,
+    runs_of,
+    state,
+)
 from es_service.runs.view import open_run
 from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.store import digest
@@ -341,3 +361,98 @@ def _row(status: RunStatus) -> tuple[str, ...]:
         f"{row['map_cells']:,}" if "map_cells" in row else "-",
         state(status),
     )
+
+
+# The command `help`: sections of the guides in the terminal, for whoever has a wheel and no clone.
+
+PACKAGE = Path(__file__).parents[1]
+CLONE = PACKAGE.parent
+GUIDES = {
+    "using": (PACKAGE / "guides" / "using.md",),
+    "tutorial": (PACKAGE / "guides" / "tutorial.md",),
+    "certify": (PACKAGE / "guides" / "certify.md",),
+    **{
+        name: tuple(folder / f"{file}.md" for folder in (CLONE / "configs", PACKAGE / "shipped_configs"))
+        for name, file in {
+            "configs": "README",
+            "which_method": "which_method",
+            "methods": "methods",
+            "parts": "parts",
+            "keys": "keys",
+            "sweeps": "sweeps",
+            "own_searches": "own_searches",
+            "other_libraries": "other_libraries",
+        }.items()
+    },
+    "workers": (CLONE / "workers" / "README.md",),
+    "own_tasks": (CLONE / "workers" / "own_tasks.md",),
+    "other_suites": (CLONE / "workers" / "other_suites.md",),
+    "policies": (CLONE / "workers" / "policies.md",),
+    "docker": (CLONE / "docker" / "README.md", PACKAGE / "launch_files" / "README.md"),
+    "es_service": (PACKAGE / "README.md",),
+    "simd": (CLONE / "workers" / "simd" / "README.md",),
+}
+"""Guide -> its file in a clone, and in an installed package where that is another."""
+
+
+class Section(NamedTuple):
+    """A heading of a guide, and what stands below it."""
+
+    guide: str
+    level: int
+    heading: str
+    """Without marks of code and links."""
+    text: str
+    """From the heading to the next one of the same or a higher level."""
+
+
+def sections() -> list[Section]:
+    """Of all guides that are here, in their order."""
+    found = []
+    for guide, files in GUIDES.items():
+        text = next((file.read_text() for file in files if file.exists()), "")
+        outside_of_code = re.sub(r"^```.*?^```", lambda block: re.sub(r"\S", "-", block[0]), text, flags=re.M | re.S)
+        headings = [*re.finditer(r"^(#+) (.*)$", outside_of_code, re.MULTILINE)]
+        for number, heading in enumerate(headings):
+            level = len(heading[1])
+            later = (other.start() for other in headings[number + 1 :] if len(other[1]) <= level)
+            plain = re.sub(r"`|\[([^\]]*)\]\([^)]*\)", r"\1", heading[2])
+            found.append(Section(guide, level, plain, text[heading.start() : next(later, len(text))]))
+    return found
+
+
+def named(topic: str, of: list[Section]) -> list[Section]:
+    """Sections whose headings have all words of a topic, the shortest heading first."""
+    words = topic.lower().split()
+    found = [section for section in of if all(word in section.heading.lower() for word in words)]
+    return sorted(found, key=lambda section: len(section.heading))
+
+
+def help_(
+    topic: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[TOPIC]", help="Words of a section's heading, or a guide; default: list all sections."),
+    ] = None,
+) -> None:
+    """Print a section of the guides."""
+    everything, words = sections(), " ".join(topic or ())
+    if not words:
+        for section in everything:
+            if section.level <= 2:
+                print_line(console, f"{'  ' * section.level}{section.heading}", "bold" if section.level == 1 else None)
+        return
+    found = [section for section in everything if section.guide == words] or named(words, everything)
+    if not found:
+        known = [section.heading for section in everything]
+        near = nearest(words, known)
+        raise ConfigError(
+            f"help {words}: no heading of the guides has these words{did_you_mean(words, known)}; `es-service help` "
+            "lists them",
+            suggestion=near and f"es-service help {near}",
+        )
+    if console.is_terminal:
+        console.print(Markdown(found[0].text))
+    else:
+        print(found[0].text, end="")
+    if others := [section.heading for section in found[1:] if section.guide != words]:
+        print_line(console, f"\nother sections: {'; '.join(others)}")

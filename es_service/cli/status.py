@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from es_service.cli.printing import command, print_line, settings, way_command
+from es_service.cli.common import command, print_line, settings, way_command
 from es_service.errors import StoreError, counted
 from es_service.loop.history import evaluated_nouns
 from es_service.report.facts import number
@@ -21,14 +21,16 @@ from es_service.runs.certified import (
     pairs_sentence,
     tries_sentence,
 )
-from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.run_status import (
+    FAULTS_OF,
+    Recent,
     RunStatus,
     doing,
     how_to_continue,
     is_waiting,
     more,
     population_size,
+    read_recent,
     read_status,
     state,
 )

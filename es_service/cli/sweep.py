@@ -22,18 +22,16 @@ from rich.table import Table
 from rich.text import Text
 
 from es_service import api
-from es_service.cli.options import (
+from es_service.cli.common import (
     AddressOption,
     EngineOption,
     LinesOption,
     LogLevelOption,
     LogOption,
     SetOption,
-    overrides,
-)
-from es_service.cli.printing import (
     console,
     errors,
+    overrides,
     print_config_notes,
     print_error,
     print_json_line,
@@ -45,8 +43,7 @@ from es_service.config.text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem, counted
 from es_service.protocol.system import given_path
 from es_service.report.progress import ShowNotice, print_notice, short
-from es_service.runs.sweep import OnProgress, SweptRun, run_planned
-from es_service.runs.sweep_commands import Certifying
+from es_service.runs.sweep import Certifying, OnProgress, SweptRun, run_planned
 from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
 from es_service.runs.tracking import check_trackers
 

@@ -21,8 +21,7 @@ from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
 from es_service.report.measures import CERTIFIED, GAP, SUCCESS, has_curve, measures
 from es_service.report.series import X_AXES, Chart, Line, axes_of
-from es_service.runs.setting_words import settings_words
-from es_service.runs.sweep_plan import ENVIRONMENT
+from es_service.runs.sweep_plan import ENVIRONMENT, settings_words
 
 POINTS = 200
 """Equally spaced points of a curve; the ends of each group are points, too."""

@@ -25,9 +25,8 @@ from es_service.protocol.messages import TaskSpec
 from es_service.report.measures import with_derived
 from es_service.report.series import IN_EVERY_RUN, Columns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
-from es_service.runs.folders import group_of
-from es_service.runs.run_status import RunStatus, status_at
-from es_service.runs.strangers import sizes_of, sound_meta
+from es_service.runs.run_status import RunStatus, group_of, status_at
+from es_service.runs.snapshot import sizes_of, sound_meta
 from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.lock import lock_holder

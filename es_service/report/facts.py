@@ -22,8 +22,7 @@ from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
 from es_service.runs.identity import code_changes
-from es_service.runs.recent import invalid_members, objectives, weights
-from es_service.runs.run_status import population_size, state
+from es_service.runs.run_status import invalid_members, objectives, population_size, state, weights
 from es_service.runs.selection import Measure
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.settings import UndeclaredSettings

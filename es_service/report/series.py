@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.loop.history import METRIC, evaluated_word
-from es_service.runs.recent import objectives, weights
+from es_service.runs.run_status import objectives, weights
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Column name -> its values; NaN stands for no value."""

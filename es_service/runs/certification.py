@@ -5,7 +5,7 @@ are therefore reduced by successive halving with *selection* episodes, and only 
 *certification* episodes. Both have a domain of random streams of their own, which no seed of `evaluate` reaches, and
 each certification of a run has new episodes. The certified policy is the one that the selection episodes put first,
 never the one with the best certified value. Whether a run has reached `budget.target_certified` is decided by episodes
-of a third domain (`targets.py`).
+of a third domain (`sessions.py`).
 
 Axes: N candidates, E episodes, D policy parameters, O observation.
 """

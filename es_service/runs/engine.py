@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,17 +26,57 @@ from es_service.dispatch.dispatch_log import Entry, Log, no_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Compiled, Limits
 from es_service.dispatch.inline_engine import inline_engine
+from es_service.logs import logger
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Report, WorkerSpec
 from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.protocol.process_environment import require_no_import_of_a_task
-from es_service.runs.reports import reader_of_reports
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.worker_count import work_at_once, worker_count
+from es_service.store.lock import MOST_LINE, MOST_LINES, RunLock
 from workers.actor import WorkerActor
 from workers.asked_rows import described
 from workers.rollouts import BACKENDS
 from workers.simd.backend.cache import cache_folder
+
+# What becomes of the reports of workers: what they print, and why they are replaced by new processes.
+
+_LOG = logger(__name__)
+NOTED_S = 1.0
+"""Least time in seconds between two changes of what `status` reads."""
+
+
+def reader_of_reports(
+    on_notice: Callable[[str], None], on_output: Callable[[str], None], lock: RunLock | None = None
+) -> Callable[[str, Report], None]:
+    """Function of a worker's name and a report of it.
+
+    Args:
+        on_notice: called with a sentence when a worker is replaced for the first time.
+        on_output: called with each line that a worker has printed.
+        lock: gets the newest lines, for `status`; None: nobody else reads them.
+    """
+    newest: deque[str] = deque(maxlen=MOST_LINES)
+    noted_s, replaced = 0.0, 0
+
+    def read(worker: str, report: Report) -> None:
+        nonlocal noted_s, replaced
+        for line in report.printed.splitlines():
+            newest.append(f"{worker}: {line}"[:MOST_LINE])
+            on_output(f"{worker}: {line}")
+        if report.printed and lock is not None:
+            is_due = (now_s := time.monotonic()) >= noted_s + NOTED_S
+            lock.note_output(newest, write=is_due)
+            noted_s = now_s if is_due else noted_s
+        if report.spent:
+            sentence = f"{worker} is replaced by a new process, since {report.spent}"
+            _LOG.info(sentence)
+            replaced += 1
+            if replaced == 1:
+                on_notice(f"{sentence}. Later replacements are in the log (--log-level info)")
+
+    return read
+
 
 CALLS_S = 60.0
 """Seconds in which the process of a function can be replaced, beside the time of its calls."""

@@ -31,8 +31,7 @@ from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.checked_config import changed_config, load_config
-from es_service.runs.engine import make_engine
-from es_service.runs.reports import reader_of_reports
+from es_service.runs.engine import make_engine, reader_of_reports
 from es_service.runs.session import initial_policy
 
 _LOG = logger(__name__)

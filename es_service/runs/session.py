@@ -33,11 +33,10 @@ from es_service.protocol.evaluator import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
-from es_service.runs.engine import make_engine
+from es_service.runs.engine import make_engine, reader_of_reports
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
-from es_service.runs.reports import reader_of_reports
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.strangers import require_sound_state
+from es_service.runs.snapshot import require_sound_state
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import patient_store
 from es_service.search.algorithms import ALGORITHMS

@@ -6,20 +6,49 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from es_service.config.given import Overrides, Source, parse_overrides
+from es_service.config.keys import FIELDS, all_search_fields
 from es_service.config.loading import read
 from es_service.config.model import Kept, RunConfig
 from es_service.config.text import in_line, one_of, plain, show
 from es_service.errors import ConfigError, Problem, StoreError, counted
 from es_service.runs.checked_config import KNOWN, accepted, changes_from
-from es_service.runs.setting_words import settings_words
 from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.store.folder import holds_run
+
+# How settings of compared runs are named in pages and figures.
+
+ALGORITHM = "search.algorithm"
+
+
+def settings_words(settings: Mapping[str, Any]) -> str:
+    """Some settings in words: "sigma = 0.1, newest = no limit". The method has its name alone.
+
+    A key has its section only if another one of these keys ends in the same name.
+    """
+    leaves = [key.rpartition(".")[2] for key in settings]
+    words = []
+    for leaf, (key, value) in zip(leaves, settings.items(), strict=True):
+        text = _meaning_of_null(key) if value is None else in_line(value)
+        name = leaf if leaves.count(leaf) == 1 else key
+        words.append(text if key == ALGORITHM else f"{name} = {text}")
+    return ", ".join(words)
+
+
+@cache
+def _meaning_of_null(key: str) -> str:
+    """What the description of a key says of null; "none" if it says nothing short."""
+    field = FIELDS.get(key) or all_search_fields(ALGORITHMS).get(key)
+    found = re.search(r"\bnull: ([^.,;]{1,40})[.,;]", (field and field.description) or "")
+    return found[1] if found else "none"
+
 
 SEED, ENVIRONMENT = "seed", "task.environment"
 Grid = Mapping[str, Sequence[Any]]

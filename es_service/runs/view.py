@@ -25,8 +25,17 @@ from es_service.runs.certified import (
     is_same_policy,
     newest_certified,
 )
-from es_service.runs.snapshot import Policy, Snapshot, acting, descriptor_names, map_names
-from es_service.runs.strangers import policy_spec, sound_contents, sound_meta, sound_nodes
+from es_service.runs.snapshot import (
+    Policy,
+    Snapshot,
+    acting,
+    descriptor_names,
+    map_names,
+    policy_spec,
+    sound_contents,
+    sound_meta,
+    sound_nodes,
+)
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.digest import checked_parts, digest_of

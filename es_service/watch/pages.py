@@ -17,9 +17,8 @@ from es_service.report.maps import empty_pattern
 from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
-from es_service.runs.recent import FAULTS_OF, read_recent
 from es_service.runs.replay import CERTIFIED
-from es_service.runs.run_status import state
+from es_service.runs.run_status import FAULTS_OF, read_recent, state
 from es_service.watch.channels import Picture
 from es_service.watch.runs import FoundRun, RunReading, Runs, RunSummary
 

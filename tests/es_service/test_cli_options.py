@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from es_service.cli import options as cli_options
+from es_service.cli import common as cli_options
 from es_service.errors import ConfigError
 from tests.es_service.config_examples import MINIMAL, load
 

@@ -23,8 +23,7 @@ from gymnasium.wrappers import vector
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from es_service.environments import drawing
-from es_service.environments.single import TaskEnv
-from es_service.environments.vector import TaskVectorEnv
+from es_service.environments.vector import TaskEnv, TaskVectorEnv
 from es_service.errors import ServiceError
 from es_service.gymnasium import id_of
 from es_service.protocol.noise import Domain, stream_keys

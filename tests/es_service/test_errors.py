@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.cli.printing import error_message, way_command
+from es_service.cli.common import error_message, way_command
 from es_service.config.given import parse_overrides
 from es_service.errors import ConfigError, EvaluationError, StoreError, WayOut
 from tests.system.session import SMALL

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from es_service.api import load_config
-from es_service.cli.printing import error_message
+from es_service.cli.common import error_message
 from es_service.errors import ConfigError, WayOut
 from es_service.runs import export
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from es_service.cli.guides import GUIDES, help_, named, sections
+from es_service.cli.show import GUIDES, help_, named, sections
 from es_service.errors import ConfigError
 
 

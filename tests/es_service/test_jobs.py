@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from es_service.api import load_config
 from es_service.cli import jobs as cli_jobs
 from es_service.cli import sweep
+from es_service.cli.common import error_message
 from es_service.cli.main import app
-from es_service.cli.printing import error_message
 from es_service.config.given import parse_overrides
 from es_service.config.text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError, StoreError

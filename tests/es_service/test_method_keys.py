@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from es_service import api
-from es_service.cli.printing import print_config_notes
+from es_service.cli.common import print_config_notes
 from es_service.config.given import shipped_configs
 from es_service.config.keys import all_search_fields, has_effect, methods_with, no_effect
 from es_service.config.loading import Known, read

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from es_service import api, write_comparison, write_report
-from es_service.cli.printing import text_console
+from es_service.cli.common import text_console
 from es_service.cli.status import print_status, print_summary
 from es_service.errors import ConfigError
 from es_service.runs.export import export

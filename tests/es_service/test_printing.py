@@ -14,8 +14,8 @@ from rich.live import Live
 
 import es_service.cli
 from es_service import api
-from es_service.cli import printing, sweep
-from es_service.cli.printing import command, print_line, text_console
+from es_service.cli import common, sweep
+from es_service.cli.common import command, print_line, text_console
 from es_service.cli.show import print_catalogue, print_overview
 from es_service.cli.status import print_status, print_summary
 from es_service.config.text import show
@@ -43,7 +43,7 @@ def test_only_one_module_makes_consoles():
     """Others would have rich's defaults."""
     others = r"\bConsole\(|from rich import|typer\.(echo|secho|style)"
     files = Path(es_service.cli.__file__).parent.rglob("*.py")
-    assert [file.name for file in files if re.search(others, file.read_text())] == ["printing.py"]
+    assert [file.name for file in files if re.search(others, file.read_text())] == ["common.py"]
 
 
 @pytest.mark.slow
@@ -57,11 +57,11 @@ def test_names_and_values_of_a_user_are_printed_as_they_are(console, tmp_path, m
     print_catalogue(console, {"my:T": task})
     runs = [SweptRun(STRANGE, folder, {}, "failed", None, STRANGE)]
     console.print(sweep.live_table(STRANGE, runs, 200, 40))
-    monkeypatch.setattr(printing, "console", console)
-    monkeypatch.setattr(printing, "errors", console)
-    printing.print_finding("FAIL", STRANGE)
-    printing.print_note(STRANGE)
-    printing.print_error(StoreError(STRANGE))
+    monkeypatch.setattr(common, "console", console)
+    monkeypatch.setattr(common, "errors", console)
+    common.print_finding("FAIL", STRANGE)
+    common.print_note(STRANGE)
+    common.print_error(StoreError(STRANGE))
     printed = console.file.getvalue()
     assert printed.count(folder.name) >= 5
     assert printed.count(STRANGE) == 6

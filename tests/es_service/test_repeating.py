@@ -10,8 +10,8 @@ import typer
 from rich.console import Console
 
 from es_service import api
+from es_service.cli.session import verify
 from es_service.cli.status import print_status
-from es_service.cli.verify import verify
 from es_service.config.tasks import TASKS
 from tests.helpers import workers_in_this_process
 

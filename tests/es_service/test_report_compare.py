@@ -19,7 +19,7 @@ from es_service.report.facts import number
 from es_service.report.figures import draw_overview, empty_figure, write_figures
 from es_service.report.floor import beside_walls
 from es_service.report.write import write_comparison, write_report
-from es_service.runs.folders import GROUPS, INSIDE, write_groups
+from es_service.runs.run_status import GROUPS, INSIDE, write_groups
 from es_service.search.maps.behaviour_map import BehaviourMap
 from tests.database import execute
 from tests.es_service.test_report_page import EVIL, Elements, task_with

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.cli.printing import error_message
+from es_service.cli.common import error_message
 from es_service.errors import StoreError
 from es_service.protocol.options import choice
 from es_service.report import floor, maps

@@ -8,7 +8,7 @@ import pytest
 
 from es_service import api
 from es_service.api import load_config
-from es_service.cli.printing import error_message
+from es_service.cli.common import error_message
 from es_service.config.sections import ComputeConfig, TaskConfig
 from es_service.config.workload import chunks_at_once, chunks_of_phases, parallel_sentence
 from es_service.dispatch.events import (

@@ -15,8 +15,7 @@ from es_service.cli.evaluate import csv_file
 from es_service.cli.main import app
 from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
 from es_service.runs import evaluation
-from es_service.runs.folders import runs_of
-from es_service.runs.run_status import newest_runs
+from es_service.runs.run_status import newest_runs, runs_of
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
 from tests.database import execute

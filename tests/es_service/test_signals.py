@@ -118,7 +118,7 @@ def test_the_exit_code_names_the_signal_whoever_has_caught_it(raised, code, monk
 
     monkeypatch.setattr(signals.EARLY, "number", signal.SIGTERM)
     monkeypatch.setattr(sys, "argv", ["es-service", "status", "anywhere"])
-    monkeypatch.setattr("es_service.cli.options.runs_of", interrupted)
+    monkeypatch.setattr("es_service.cli.common.runs_of", interrupted)
     with pytest.raises(Interrupted) as stopped:
         main()
     assert 128 + stopped.value.signal_number == code

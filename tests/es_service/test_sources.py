@@ -73,7 +73,7 @@ def elsewhere(tmp_path_factory):
 def test_an_unchanged_checkout_at_another_path_has_the_same_code(elsewhere):
     folder, said = elsewhere
     for file, old, new in (
-        ("es_service/cli/options.py", 'help="Change one key', 'help="Set one key'),
+        ("es_service/cli/common.py", 'help="Change one key', 'help="Set one key'),
         ("es_service/cli/main.py", "import typer\n", "import typer  # a comment\n"),
         ("es_service/api.py", "RUNS_FOLDER", "WHERE_RUNS_ARE"),
         ("es_service/runs/view.py", "import os\n", "import os  # a comment\n"),

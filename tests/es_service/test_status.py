@@ -16,15 +16,15 @@ from typer.testing import CliRunner
 
 from es_service import api
 from es_service.cli import status
+from es_service.cli.common import settings, text_console
 from es_service.cli.main import app
-from es_service.cli.printing import settings, text_console
 from es_service.cli.show import print_overview
 from es_service.cli.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
 from es_service.report.data import read_run
 from es_service.report.facts import what_was_run
-from es_service.runs import recent
+from es_service.runs import run_status
 from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
@@ -53,8 +53,8 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
 
     sound_rows = reader._sound_rows
     monkeypatch.setattr(reader, "_sound_rows", no_more_than_one)
-    monkeypatch.setattr(recent, "FAULTS_OF", 1)
-    monkeypatch.setattr(recent, "CENTRES", 1)
+    monkeypatch.setattr(run_status, "FAULTS_OF", 1)
+    monkeypatch.setattr(run_status, "CENTRES", 1)
     print_status(console, run)
     follow_status(console, run)
     print_summary(console, run, "")
@@ -65,7 +65,7 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
     run = api.open_run(write_run(tmp_path / "run", generations=20))  # its only faults are those of generation 5
     counted = "\nfaults handled     1 worker replaced, 2 chunks sent again"
     for most, expected in ((1000, [f"{counted}\n"]), (16, [f"{counted} in the last 16 generations\n"]), (15, [])):
-        for module in (recent, status):
+        for module in (run_status, status):
             monkeypatch.setattr(module, "FAULTS_OF", most)
         print_status(console, run)
         assert re.findall("\nfaults .*\n", capsys.readouterr().out) == expected
@@ -96,7 +96,7 @@ def test_the_share_of_invalid_members_is_said_after_the_run_if_there_were_any(co
     ],
 )
 def test_invalid_members_are_a_share_where_the_number_of_members_is_known(invalid_G, moved, evaluated, expected):
-    assert recent.invalid_members({"search.pairs": 50}, invalid_G, moved, evaluated) == expected
+    assert run_status.invalid_members({"search.pairs": 50}, invalid_G, moved, evaluated) == expected
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_with_one_centre_a_generation_the_share_is_that_of_recent_generations(co
     """It exploited in generations 10 to 19, and explored before and after."""
     run = api.open_run(write_run(tmp_path / "run", generations=20))
     for centres, expected in ((1000, "of the last 20, 50.0 % explored"), (3, "of the last 3, 33.3 % explored")):
-        monkeypatch.setattr(recent, "CENTRES", centres)
+        monkeypatch.setattr(run_status, "CENTRES", centres)
         print_status(console, run)
         assert f"\ncentres            1 exploring, 0 exploiting; {expected}\n" in capsys.readouterr().out
 

@@ -8,7 +8,7 @@ import pytest
 from es_service import api
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, PlainStep
 from es_service.errors import StoreError
-from es_service.runs.strangers import policy_spec, sound_nodes
+from es_service.runs.snapshot import policy_spec, sound_nodes
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.steps import STEPS, restarted
 from tests.es_service.store_examples import CONSTANTS, meta

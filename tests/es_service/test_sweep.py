@@ -21,12 +21,11 @@ from es_service.cli.sweep import grid_of, live_table, seeds_of, steps_of
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
-from es_service.runs import sweep_commands, sweep_cores
-from es_service.runs.setting_words import settings_words
-from es_service.runs.sweep import INSIDE, SweptRun, sweep
-from es_service.runs.sweep_commands import Certifying, command_of
-from es_service.runs.sweep_cores import divide, share
-from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
+from es_service.runs import sweep as sweep_commands
+from es_service.runs import worker_count
+from es_service.runs.sweep import INSIDE, Certifying, SweptRun, command_of, sweep
+from es_service.runs.sweep_plan import Labelled, left_out_notes, plan, settings_words
+from es_service.runs.worker_count import divide, share
 from tests.es_service.config_examples import MINIMAL
 from tests.run_examples import write_run
 
@@ -290,25 +289,25 @@ def test_runs_share_the_cores_of_a_machine():
 
 def test_a_cluster_is_asked_for_its_nodes_only_if_runs_share_it(monkeypatch):
     nodes, asked = [], []
-    monkeypatch.setattr(sweep_cores, "nodes_of_cluster", lambda address: asked.append(address) or nodes)
+    monkeypatch.setattr(worker_count, "nodes_of_cluster", lambda address: asked.append(address) or nodes)
     auto, two = config(engine="ray", address="head:6379"), config(engine="ray", address="head:6379", workers=2)
-    assert sweep_cores.shared([auto, auto], 1).workers == ("auto", "auto")
-    assert sweep_cores.shared([auto], 4).workers == ("auto",)
-    assert sweep_cores.shared([two, two], 2).workers == (2, 2)
+    assert worker_count.shared([auto, auto], 1).workers == ("auto", "auto")
+    assert worker_count.shared([auto], 4).workers == ("auto",)
+    assert worker_count.shared([two, two], 2).workers == (2, 2)
     assert asked == []
     with pytest.raises(ConfigError, match="the cluster at head:6379 has no cores yet that runs could share"):
-        sweep_cores.shared([auto, auto], 2)
+        worker_count.shared([auto, auto], 2)
     nodes += [4, 4, 4, 4]
-    assert sweep_cores.shared([auto] * 3, 3).workers == (4, 4, 4)
+    assert worker_count.shared([auto] * 3, 3).workers == (4, 4, 4)
     assert asked == ["head:6379"] * 2
     nodes[:] = [8, 8, 8, 8]
     small = config(engine="ray", address="head:6379", chunk_pairs=16)
     few = small.model_copy(update={"search": small.search.model_copy(update={"pairs": 9 * 16})})
-    assert sweep_cores.shared([few] * 2, 2).workers == (16, 16), "two actors of a node, not nine of one core"
+    assert worker_count.shared([few] * 2, 2).workers == (16, 16), "two actors of a node, not nine of one core"
     with pytest.raises(ConfigError, match="parallel: 0 is not allowed"):
-        sweep_cores.shared([auto], 0)
+        worker_count.shared([auto], 0)
     with pytest.raises(ConfigError, match="50000 workers are too many for this machine"):
-        sweep_cores.shared([config(), config(workers=50_000)])
+        worker_count.shared([config(), config(workers=50_000)])
 
 
 @given(st.integers(1, 9), st.integers(1, 64), st.integers(1, 40))

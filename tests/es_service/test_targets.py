@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.cli.printing import text_console
+from es_service.cli.common import text_console
 from es_service.cli.show import status_data
 from es_service.cli.status import print_status, print_summary
 from es_service.protocol.noise import Domain
 from es_service.report.data import read_run
 from es_service.report.facts import what_was_run
-from es_service.runs import run_status, targets
+from es_service.runs import run_status, sessions
 from es_service.runs.certification import Named, certify_run
 from es_service.runs.certified import (
     EPISODES,
@@ -124,7 +124,7 @@ def test_a_run_that_was_interrupted_before_its_certification_begins_with_it(whol
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(targets, "certify_best", interrupted)
+        patch.setattr(sessions, "certify_best", interrupted)
         with pytest.raises(KeyboardInterrupt):
             api.run(config, tmp_path / "run")
     outcome = api.resume(tmp_path / "run")
@@ -134,7 +134,7 @@ def test_a_run_that_was_interrupted_before_its_certification_begins_with_it(whol
 def test_a_run_that_was_interrupted_after_its_decision_is_over_once_the_value_is_certified(tmp_path, monkeypatch):
     config = api.load_config(CONFIG, ["budget.target_certified=-1000"])
     expected = api.run(config, tmp_path / "expected")
-    run_episodes = targets.new_episodes
+    run_episodes = sessions.new_episodes
 
     def interrupted(*asked: object) -> object:
         if asked[-1] == Domain.CERTIFICATION_RESET:
@@ -142,7 +142,7 @@ def test_a_run_that_was_interrupted_after_its_decision_is_over_once_the_value_is
         return run_episodes(*asked)
 
     with monkeypatch.context() as patch:
-        patch.setattr(targets, "new_episodes", interrupted)
+        patch.setattr(sessions, "new_episodes", interrupted)
         with pytest.raises(KeyboardInterrupt):
             api.run(config, tmp_path / "run")
     run = api.open_run(tmp_path / "run")
@@ -244,9 +244,9 @@ def test_of_several_decisions_that_reach_a_target_the_newest_counts(tmp_path):
     folder = api.run(api.load_config(CONFIG, ["budget.target_certified=-1000"]), tmp_path / "run").run.folder
     decision, report = all_certifications(folder)
     later = [replace(decision, number=2, tries=2), replace(report, number=3)]
-    assert targets.passed([decision, report, *later], -1000, "sum") is later[0]
-    assert targets.report_of([decision, report, *later], later[0]) is later[1]
-    assert targets.report_of([decision, report, later[0]], later[0]) is None, "that of the one before is older"
+    assert sessions.passed([decision, report, *later], -1000, "sum") is later[0]
+    assert sessions.report_of([decision, report, *later], later[0]) is later[1]
+    assert sessions.report_of([decision, report, later[0]], later[0]) is None, "that of the one before is older"
 
 
 def made_up_episodes(kind, rng, mean):
@@ -284,14 +284,14 @@ def test_the_interval_of_what_ends_a_run_holds_the_truth_in_95_of_100_made_up_ru
             def episodes_of(policy, number, domain, run=run, truth=truth):
                 return made_up_episodes(kind, np.random.default_rng([run, number, domain]), truth)
 
-            assert targets.due_after(policies, target, "sum")({"best_fitness": fitness})
+            assert sessions.due_after(policies, target, "sum")({"best_fitness": fitness})
             best = Named("best", policy_with(np.array([tried], np.float32)), tried, fitness)
-            policies += targets.attempt(policies, best, len(policies), target, "sum", {}, episodes_of)
+            policies += sessions.attempt(policies, best, len(policies), target, "sum", {}, episodes_of)
             if not policies[-1].decides:
                 break
         *_, decision, report = policies
         assert (report.tries, report.policy) == (tried + 1, best.policy)
-        assert not targets.due_after(policies, target, "sum")({"best_fitness": fitness + 1})
+        assert not sessions.due_after(policies, target, "sum")({"best_fitness": fitness + 1})
         row, (_, low, high) = report.row(), mean_interval(decision.episodes.return_E)
         held += row["return_low"] <= truth <= row["return_high"]
         decision_held += low <= truth <= high

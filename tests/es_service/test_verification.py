@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from es_service import api
-from es_service.cli import verify as command
+from es_service.cli import session as command
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, NotInRunError, RunLockedError
 from es_service.protocol.messages import EpisodesResult, GradientResult

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from es_service.environments.single import TaskEnv
-from es_service.environments.vector import TaskVectorEnv
+from es_service.environments.vector import TaskEnv, TaskVectorEnv
 from es_service.protocol.child import NoAnswerError
 from tests.es_service.test_environments import actions_of, same
 from workers.environments import TaskError

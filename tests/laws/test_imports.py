@@ -43,7 +43,6 @@ JOINERS = {
     "es_service.asking",
     "es_service.gymnasium",
     "es_service.environments.brax_env",
-    "es_service.environments.single",
     "es_service.environments.vector",
     "es_service.runs.engine",
     "es_service.runs.snapshot",
@@ -59,10 +58,10 @@ RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 OTHER_MEANINGS = {
     "workers.xla_cache": {"xla"},
     "es_service.asking": {"asked"},
-    "es_service.cli.guides": {"simd"},
+    "es_service.cli.show": {"simd"},
     "es_service.store.lock": {"host"},
     "es_service.runs.run_status": {"host"},
-    "es_service.watch.guard": {"host"},
+    "es_service.watch.server": {"host"},
 }
 """Module -> words that mean a guide, a folder, a machine or an argument there, and not the rollouts of these names."""
 
@@ -129,7 +128,7 @@ def test_imports_go_down(path):
 @pytest.mark.parametrize(
     ("module", "source", "sentence"),
     [
-        ("es_service.store.lock", "from es_service.cli.printing import command", "cli is above store"),
+        ("es_service.store.lock", "from es_service.cli.common import command", "cli is above store"),
         ("es_service.loop.driver", "from es_service.store import writer", "store is above loop"),
         ("es_service.config.model", "import es_service.search.novelty", "search is above config"),
         ("es_service.search.novelty", "def f():\n    from es_service.loop import clock", "loop is above search"),

@@ -12,7 +12,7 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import EpisodesResult
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import EPISODES
-from es_service.runs.polishing import certified_for, polish_config
+from es_service.runs.lineage import certified_for, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from es_service import api
-from es_service.cli.printing import command
+from es_service.cli.common import command
 from es_service.errors import ConfigError
 from es_service.protocol.machine import CODE
 from es_service.protocol.sources import sha256

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from es_service import api, open_run
-from es_service.cli.printing import error_message
+from es_service.cli.common import error_message
 from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from es_service import open_run
 from es_service.cli import doctor, jobs
+from es_service.cli.common import print_json
 from es_service.cli.main import app
-from es_service.cli.printing import print_json
 from es_service.config.given import shipped_configs
 from es_service.errors import ConfigError
 from es_service.runs.jobs import Job

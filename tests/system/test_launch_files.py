@@ -20,7 +20,7 @@ import yaml
 from ray.autoscaler._private.util import prepare_config, validate_config
 
 from es_service import api
-from es_service.cli.options import overrides
+from es_service.cli.common import overrides
 from tests.system.processes import ROOT
 
 DOCKER = ROOT / "docker"

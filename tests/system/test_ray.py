@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from es_service import api
-from es_service.cli.printing import error_message
+from es_service.cli.common import error_message
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_engine import Actors, ray_engine

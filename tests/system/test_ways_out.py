@@ -14,8 +14,8 @@ import time
 import pytest
 
 from es_service import api
-from es_service.cli import printing
-from es_service.cli.printing import error_message, text_console, way_command
+from es_service.cli import common
+from es_service.cli.common import error_message, text_console, way_command
 from es_service.cli.status import follow_status, print_summary
 from es_service.config.changes import again_with, refused_changes
 from es_service.config.model import implied_by
@@ -151,17 +151,17 @@ def test_a_way_out_to_another_engine_takes_nothing_from_the_one_that_was_asked_f
 def test_commands_start_what_is_there(tmp_path, monkeypatch):
     """`make run` leaves es-service in .venv/bin, which is not in PATH; from a clone without an installation there is
     only the package."""
-    assert printing.command("list") == "es-service list"
+    assert common.command("list") == "es-service list"
     monkeypatch.setenv("PATH", os.defpath)
-    assert shlex.split(printing.command("list")) == [str(PROGRAM), "list"]
+    assert shlex.split(common.command("list")) == [str(PROGRAM), "list"]
     (tmp_path / "a b").mkdir()
     python = tmp_path / "a b" / "python"
     python.symlink_to(sys.executable)
     monkeypatch.setattr(sys, "executable", str(python))
-    assert shlex.split(printing.command("list")) == [str(python), "-m", "es_service", "list"]
+    assert shlex.split(common.command("list")) == [str(python), "-m", "es_service", "list"]
     for name, words in ((sys.executable, f"'{python}' -m es_service"), ("", "python -m es_service")):
         monkeypatch.setattr(sys, "executable", name)
-        assert printing.command("list") == f"{words} list"
+        assert common.command("list") == f"{words} list"
 
 
 def test_an_interruption_names_a_command_that_is_there(config, tmp_path):

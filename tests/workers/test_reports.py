@@ -15,7 +15,7 @@ from es_service.protocol.errors import TaskError
 from es_service.protocol.messages import EpisodesResult, Moments, Report
 from es_service.protocol.newest_output import cut
 from es_service.protocol.system import memory_of_tree_bytes
-from es_service.runs.reports import reader_of_reports
+from es_service.runs.engine import reader_of_reports
 from es_service.store.lock import MOST_LINE, MOST_LINES, acquire_lock, last_output, lock_holder
 from tests.helpers import spec
 from workers import reports
