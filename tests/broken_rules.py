@@ -473,7 +473,7 @@ CASES = [
         ),
         (
             "is that of novelty",
-            "es_service/search/objectives.py",
+            "es_service/search/shaping.py",
             "+= weight * shaped(shaping, values(objective, results))",
             "+= (1.0 - weight) * shaped(shaping, values(objective, results))",
         ),

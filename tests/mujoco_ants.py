@@ -17,8 +17,8 @@ from tests.mujoco_models import Example
 from workers.environments import SHIPPED, make_environment
 from workers.environments.ant_gymnasium import AntMazeEnv, AntTrapEnv, MujocoAntEnv
 from workers.environments.ant_model import SUBSTEPS, boxes_of, compiled
+from workers.environments.ant_mujoco import SLOTS, wall_contacts
 from workers.environments.mujoco_parts import MujocoState, mujoco
-from workers.environments.wall_boxes import SLOTS, wall_contacts
 from workers.simd.episodes.kernel import compile_kernel
 
 ENVIRONMENTS: dict[str, type[MujocoAntEnv]] = {"ant_maze": AntMazeEnv, "ant_trap": AntTrapEnv}

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import Segment
-from workers.environments import ant_maze, ant_trap, goal_cells
+from workers.environments import ant, ant_tasks
 from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
 from workers.environments.ant_tasks import WALL_RADIUS
-from workers.environments.brax_parts import Transform
+from workers.environments.brax_task import Transform
 
 Walls = tuple[Segment, ...]
 WALLS: dict[str, Walls] = {
-    "ant_maze": ant_maze.WALLS,
-    "ant_trap": ant_trap.WALLS,
-    **{maze: goal_cells.walls_of(maze) for maze in goal_cells.MAZES},
+    "ant_maze": ant.MAZE_WALLS,
+    "ant_trap": ant.TRAP_WALLS,
+    **{maze: ant_tasks.walls_of(maze) for maze in ant_tasks.MAZES},
 }
 CLEAR_M = 1.0
 """Between a start and the nearest wall's surface: no leg of an ant reaches further from its torso's surface."""
@@ -62,8 +62,8 @@ def crosses(before_2: Any, after_2: Any, walls: Walls) -> jax.Array:
 
 def inside_the_maze(place_2: Any) -> np.ndarray:
     """Whether a place is in the arena, clear of its borders."""
-    reach = ant_maze.HALF - WALL_RADIUS - TORSO_RADIUS - CLEAR_M
-    return np.abs(np.asarray(place_2) - ant_maze.MIDDLE).max(-1) < reach
+    reach = ant.HALF - WALL_RADIUS - TORSO_RADIUS - CLEAR_M
+    return np.abs(np.asarray(place_2) - ant.MIDDLE).max(-1) < reach
 
 
 def places_beside_walls(name: str, count: int, seed: int) -> np.ndarray:
@@ -75,8 +75,8 @@ def places_beside_walls(name: str, count: int, seed: int) -> np.ndarray:
     free = np.asarray(jax.jit(jax.vmap(lambda xy: depth(jnp.tile(xy, (9, 1)), walls)))(tries)) < -CLEAR_M
     if name == "ant_maze":
         free &= inside_the_maze(tries)
-    elif name in goal_cells.MAZES:
-        free &= np.array([goal_cells.is_free(name, *xy) for xy in tries])
+    elif name in ant_tasks.MAZES:
+        free &= np.array([ant_tasks.is_free(name, *xy) for xy in tries])
     chosen = tries[free][:count].astype(np.float32)
     assert len(chosen) == count
     return chosen

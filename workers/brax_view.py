@@ -19,7 +19,7 @@ from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue, defaults_of
 from workers.environments import make_environment
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 from workers.lanes import task_named
 from workers.lanes.blocks import LaneResults, lane_functions
 

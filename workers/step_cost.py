@@ -19,7 +19,7 @@ from es_service.protocol.options import OptionValue
 from workers.environments import Environment, make_environment
 from workers.simd.backend.target import NoVectorsError
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 LANES = 256
 """Environments side by side."""

@@ -13,7 +13,7 @@ from es_service.protocol.options import OptionValue
 from es_service.protocol.raised import raised
 from workers.environments import Environment, TaskError, make_environment
 from workers.simd.frontend.trace import jaxpr_digest
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 
 def require_pure(task: TaskSpec, options: Mapping[str, OptionValue]) -> None:

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.noise import Domain, stream_keys
-from workers.environments import ant_maze, ant_trap
+from workers.environments import ant
 from workers.environments.ant import make_ant
-from workers.environments.brax_parts import Motion, collisions
+from workers.environments.brax_task import Motion, collisions
 
 BATCH, STEPS, ROUNDS = 16, 60, 5
 ACTION = jnp.zeros((BATCH, 8))
@@ -37,8 +37,8 @@ def compiled(walls) -> tuple[Any, Any]:
 def main() -> None:
     variants = {
         "floor": compiled(()),
-        "floor and trap": compiled(ant_trap.WALLS),
-        "floor and maze": compiled(ant_maze.WALLS),
+        "floor and trap": compiled(ant.TRAP_WALLS),
+        "floor and maze": compiled(ant.MAZE_WALLS),
     }
     with mock.patch.object(collisions, "resolve", lambda system, state: Motion.zero((system.num_links(),))):
         variants["no contacts"] = compiled(())

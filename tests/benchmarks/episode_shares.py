@@ -35,8 +35,8 @@ from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import aligned, compile_object, load_object, words_of
 from workers.simd.backend.target import host_target
 from workers.simd.episodes.check import check_resets
+from workers.simd.episodes.hidden import plan
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.episodes.layout import plan
 from workers.simd.episodes.network import policy_function
 from workers.simd.episodes.noise import fill_function
 from workers.simd.episodes.rollout import always_zero

@@ -31,12 +31,12 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
 
     from es_service.protocol.noise import Domain, stream_keys
     from tests.wall_watch import WALLS, colliders, crosses, depth, places_beside_walls
-    from workers.environments import ant_maze, ant_tasks, goal_cells, goal_maze
+    from workers.environments import ant, ant_tasks, goal_maze
     from workers.environments.ant import make_ant
 
     if (name, drive) not in _compiled:
         walls = WALLS[name]
-        ant = make_ant(walls, near=goal_maze.WALLS_MET if name in goal_cells.MAZES else None)
+        ant = make_ant(walls, near=goal_maze.WALLS_MET if name in ant_tasks.MAZES else None)
 
         def episode(start_key, xy, key):
             def body(step, carry):
@@ -53,7 +53,7 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
                     "deepest": jnp.maximum(record["deepest"], depth(colliders(ant.system, moved), walls)),
                     "crossed": record["crossed"] | crosses(state.q[:2], moved.q[:2], walls),
                     "finite": record["finite"] & jnp.isfinite(moved.q).all() & jnp.isfinite(moved.qd).all(),
-                    "off_middle": jnp.maximum(record["off_middle"], jnp.abs(moved.q[:2] - ant_maze.MIDDLE).max()),
+                    "off_middle": jnp.maximum(record["off_middle"], jnp.abs(moved.q[:2] - ant.MIDDLE).max()),
                     "pocket": jnp.maximum(record["pocket"], jnp.where(in_pocket, reward, -jnp.inf)),
                     "highest": jnp.maximum(record["highest"], moved.q[2]),
                 }

@@ -11,7 +11,7 @@ from es_service.environments.brax_env import TaskBraxEnv, wrap
 from es_service.environments.vector import TaskVectorEnv
 from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import TaskError
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 
 ENDING = "tests.examples.cart_pole:CartPole"
 

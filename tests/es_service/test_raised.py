@@ -17,7 +17,7 @@ from es_service.dispatch.ray_calls import raised_in_actor
 from es_service.errors import ConfigError
 from es_service.protocol.raised import RaisedError, raised, users_error
 from tests.system.command_line import PROGRAM, command
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 TASK = """
 import sys

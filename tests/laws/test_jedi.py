@@ -16,7 +16,7 @@ from es_service.search.algorithms.jedi import TARGET, VISITS, is_not_dominated, 
 from es_service.search.algorithms.settings import settings_of
 from es_service.search.maps.behaviour_map import empty_map, insert
 from es_service.search.maps.geometry import Cvt, Grid, make_geometry
-from es_service.search.objectives import nearness_values
+from es_service.search.shaping import nearness_values
 from tests.helpers import policy_with
 
 POINTS_N_1 = np.array([[0.1], [0.3], [0.5]])

@@ -19,8 +19,8 @@ from es_service.search.algorithms.common import (
     novelty_of_centres,
 )
 from es_service.search.algorithms.nsra_es import adapted_weight
-from es_service.search.objectives import utilities, weighted
 from es_service.search.observation_statistics import no_observations
+from es_service.search.shaping import utilities, weighted
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws import me_es_runs
 from tests.laws.me_es_runs import SHAPE

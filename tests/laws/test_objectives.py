@@ -19,8 +19,15 @@ from es_service.protocol.messages import EpisodesResult, GradientChunk, Gradient
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.common import first_state, scheduled
 from es_service.search.novelty import empty_archive, extended
-from es_service.search.objectives import target_values, utilities, values, weight_of_fitness, weighted
-from es_service.search.shaping import SHAPINGS, centred_ranks
+from es_service.search.shaping import (
+    SHAPINGS,
+    centred_ranks,
+    target_values,
+    utilities,
+    values,
+    weight_of_fitness,
+    weighted,
+)
 from tests.laws.es_runs import run_in_memory, small_config
 
 INF, NAN = np.inf, np.nan

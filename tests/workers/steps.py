@@ -18,10 +18,10 @@ import numpy as np
 
 from workers.environments import SHIPPED, Environment, make_environment
 from workers.environments.ant import AntState, expand, load_system, physics_step
-from workers.environments.brax_parts import pipeline
+from workers.environments.brax_task import pipeline
 from workers.environments.walls import wall_rows
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 LANES = 64
 Step = Callable[[Any, Any], Any]

@@ -25,11 +25,10 @@ from workers.environments import (
     make_environment,
     make_host_task,
 )
-from workers.environments.ant_mujoco import MujocoAntState
+from workers.environments.ant_mujoco import SLOTS, MujocoAntState, wall_contacts
 from workers.environments.ant_tasks import STEP_S
 from workers.environments.host_task import HostEnvironment
 from workers.environments.mujoco_parts import contacts_as_c, mjx, mujoco, put_model
-from workers.environments.wall_boxes import SLOTS, wall_contacts
 from workers.viewer import scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")

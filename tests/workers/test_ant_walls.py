@@ -10,7 +10,7 @@ import pytest
 from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
 from tests.workers.steps import carried, of_many, pushed, resets_of, steps_of, system_of
-from workers.environments import ant_maze
+from workers.environments import ant
 from workers.environments.ant_tasks import STEP_S
 
 pytestmark = [
@@ -101,7 +101,7 @@ def test_nothing_climbs_a_wall(watched):
     assert not crossed.any()
     assert position[..., 2].max() > 2.0
     if name == "ant_maze":
-        assert np.abs(position[..., :2] - ant_maze.MIDDLE).max() < ant_maze.HALF
+        assert np.abs(position[..., :2] - ant.MIDDLE).max() < ant.HALF
 
 
 def test_walls_hold_wherever_an_ant_is_pushed(watched):
@@ -115,4 +115,4 @@ def test_walls_hold_wherever_an_ant_is_pushed(watched):
     assert deepest.max() < 0.1
     assert (deepest.max(1) > 0).mean() > 0.4, "most of them must have touched a wall"
     if name == "ant_maze":
-        assert np.abs(position[..., :2] - ant_maze.MIDDLE).max() < ant_maze.HALF
+        assert np.abs(position[..., :2] - ant.MIDDLE).max() < ant.HALF

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from workers.environments.ant import physics_step
-from workers.environments.brax_parts import brax_contact, collisions, pipeline
+from workers.environments.brax_task import brax_contact, collisions, pipeline
 
 
 def test_threads_that_trace_substeps_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,15 +16,7 @@ from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.steps import control_step, of_many
-from workers.environments import (
-    TaskError,
-    brax_parts,
-    brax_task,
-    declared,
-    describe_environment,
-    make_environment,
-    user_task,
-)
+from workers.environments import TaskError, brax_task, declared, describe_environment, make_environment, user_task
 from workers.simd.episodes import rollout
 from workers.simd.episodes.kernel import compile_kernel
 
@@ -226,15 +218,15 @@ def test_a_worker_runs_the_example():
 
 
 def test_versions_that_do_not_work_are_named(monkeypatch):
-    monkeypatch.setitem(brax_parts.WORKS_WITH, "mujoco", ("3.2.", "3.3."))
+    monkeypatch.setitem(brax_task.WORKS_WITH, "mujoco", ("3.2.", "3.3."))
     with pytest.raises(
         TaskError, match=r"mujoco \S+ is installed, but mujoco 3\.2\.\* or 3\.3\.\* is required: pip install"
     ):
-        brax_parts.check_versions()
-    monkeypatch.setitem(brax_parts.WORKS_WITH, "no-such-package", ("1.",))
-    monkeypatch.delitem(brax_parts.WORKS_WITH, "mujoco")
+        brax_task.check_versions()
+    monkeypatch.setitem(brax_task.WORKS_WITH, "no-such-package", ("1.",))
+    monkeypatch.delitem(brax_task.WORKS_WITH, "mujoco")
     with pytest.raises(TaskError, match=r"no-such-package is not installed"):
-        brax_parts.check_versions()
+        brax_task.check_versions()
 
 
 def test_an_ant_of_mjx_runs_with_simd():

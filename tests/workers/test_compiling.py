@@ -12,7 +12,7 @@ from tests.helpers import centre, random_parameters, spec
 from tests.workers.test_worker import bits
 from workers.simd.episodes import kernel, rollout
 from workers.simd.episodes.compiled import EpisodeKernel
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 from workers.worker import make_worker
 
 POINT = centre(random_parameters(1))

@@ -13,8 +13,17 @@ from es_service.protocol.noise import Domain, stream_keys
 from tests.workers.steps import carried, of_many, resets_of
 from workers.environments import make_environment
 from workers.environments.ant import make_ant
-from workers.environments.ant_tasks import WALL_RADIUS
-from workers.environments.goal_cells import BLOCK, CELL_M, MAZES, bounds_of, cells_of, goals_of, is_free, walls_of
+from workers.environments.ant_tasks import (
+    BLOCK,
+    CELL_M,
+    MAZES,
+    WALL_RADIUS,
+    bounds_of,
+    cells_of,
+    goals_of,
+    is_free,
+    walls_of,
+)
 from workers.environments.goal_maze import WALLS_MET, GoalState
 from workers.environments.walls import wall_rows, walls_near
 from workers.simd.episodes.kernel import compile_kernel

@@ -13,7 +13,7 @@ from workers.environments import TaskError, mujoco_parts
 from workers.environments.mujoco_parts import MjModel, mujoco
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.tracer import PRIMITIVES
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 BALLS = """<mujoco>
   <option gravity="0 0 -10" {option}/>

@@ -11,8 +11,8 @@ import pytest
 from es_service.protocol.noise import Domain, stream_keys
 from tests.references import point_maze as reference
 from tests.workers.steps import resets_of
-from workers.environments import SHIPPED, make_environment
-from workers.environments.goal_cells import MAZES
+from workers.environments import SHIPPED, SHIPPED_IN, make_environment
+from workers.environments.ant_tasks import MAZES
 
 ENVIRONMENT = make_environment("point_maze", {})
 step = jax.jit(ENVIRONMENT.step)
@@ -92,8 +92,9 @@ def test_reset_covers_its_rectangle_and_corner_is_fixed():
 def test_task_table_tells_the_truth(name):
     """The driver plans with the table and never sees the module; a wrong size would only show in a worker."""
     task = SHIPPED[name]
-    module = "goal_maze" if name in MAZES else name
-    takes = inspect.signature(importlib.import_module(f"workers.environments.{module}").make).parameters
+    module, function = ("goal_maze", "make") if name in MAZES else (SHIPPED_IN[name], name)
+    made_by = getattr(importlib.import_module(f"workers.environments.{module}"), function)
+    takes = inspect.signature(made_by).parameters
     defaults = {option: declared.default for option, declared in task.options.items()}
     assert defaults == {x.name: x.default for x in takes.values() if x.name != "maze"}
     environment = make_environment(name, defaults)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from workers.environments import ant_maze, ant_trap
+from workers.environments import ant
 from workers.environments.ant_tasks import WALL_RADIUS
 from workers.environments.walls import nearest_wall, wall_rows
 
@@ -31,7 +31,7 @@ def least_distance(walls, foot, knee, points=2001):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("walls", [ant_maze.WALLS, ant_trap.WALLS], ids=["maze", "trap"])
+@pytest.mark.parametrize("walls", [ant.MAZE_WALLS, ant.TRAP_WALLS], ids=["maze", "trap"])
 def test_distance_is_the_least_to_any_wall(walls):
     rng = np.random.default_rng(0)
     ends = np.concatenate([np.array(wall) for wall in walls])

@@ -12,8 +12,7 @@ from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.options import OptionValue, choice
 from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS, SUITES, meant_environment
-from workers.environments.ant_tasks import ANT_CLEARANCE
-from workers.environments.goal_cells import MAZES, goal_maze
+from workers.environments.ant_tasks import ANT_CLEARANCE, MAZES, goal_maze
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -86,6 +85,10 @@ SHIPPED: Mapping[str, TaskSpec] = {
     **{name: goal_maze(name) for name in MAZES},
 }
 """Descriptions of the shipped tasks by name. A test compares each with the task's module."""
+SHIPPED_IN = {"point_maze": "point_maze", "ant_maze": "ant", "ant_trap": "ant"}
+"""Task without a maze of cells -> the module with the function of its name that makes it."""
+ADAPTERS = {"brax": "brax_task", "mujoco": "mujoco_gym", **{suite: f"{suite}_task" for suite in SUITES}}
+"""Prefix of tasks in JAX from elsewhere -> the module that describes and makes them."""
 
 
 @dataclass(frozen=True)
@@ -133,20 +136,16 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     if name in MAZES:
         return importlib.import_module("workers.environments.goal_maze").make(name, **options)
     if not colon:
-        return importlib.import_module(f"workers.environments.{name}").make(**options)
-    if prefix == "brax":
-        from workers.environments import brax_task
-
-        return brax_task.make(rest, **options)
-    if prefix == "mujoco":
-        from workers.environments import mujoco_gym
-
-        return mujoco_gym.make(rest, **options)
-    if prefix in SUITES:
-        return importlib.import_module(f"workers.environments.{prefix}_task").make(rest, **options)
+        return getattr(importlib.import_module(f"workers.environments.{SHIPPED_IN[name]}"), name)(**options)
+    if prefix in ADAPTERS:
+        return _adapter(prefix).make(rest, **options)
     from workers.environments import user_task
 
     return user_task.make(name, options)
+
+
+def _adapter(prefix: str) -> Any:
+    return importlib.import_module(f"workers.environments.{ADAPTERS[prefix]}")
 
 
 def is_host_task(name: str) -> bool:
@@ -189,7 +188,7 @@ def make_host_task(
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
-    from workers.environments.host_descriptors import with_descriptor
+    from workers.environments.declared import with_descriptor
     from workers.environments.host_metrics import with_metrics
     from workers.environments.host_task import with_choices
 
@@ -235,16 +234,8 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
     """
     kind, _, rest = name.partition(":")
     options = settings.get("options", {})
-    if kind == "brax":
-        from workers.environments import brax_task
-
-        return brax_task.describe(rest, options)
-    if kind == "mujoco":
-        from workers.environments import mujoco_gym
-
-        return mujoco_gym.describe(rest, options)
-    if kind in SUITES:
-        return importlib.import_module(f"workers.environments.{kind}_task").describe(rest, options)
+    if kind in ADAPTERS:
+        return _adapter(kind).describe(rest, options)
     if is_host_task(name):
         if kind == LIBRARY:
             from workers.environments import gymnasium_task

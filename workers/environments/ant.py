@@ -1,4 +1,4 @@
-"""The ant of AntMaze and AntTrap: Brax's ant in its `spring` pipeline, with walls and a torso that touches the floor.
+"""AntMaze, AntTrap and their ant: Brax's ant in its `spring` pipeline, with walls and a torso that touches the floor.
 
 A substep is Brax's own `brax.spring.pipeline.step`, to which contacts with walls are added and whose contact impulses
 are recorded. A control step has ten substeps. The state between control steps is small: positions and velocities of the
@@ -19,8 +19,26 @@ import numpy as np
 from etils import epath
 
 from es_service.protocol.noise import uniforms
-from workers.environments.ant_tasks import BODIES, FORCE_LIMIT, JOINTS, RESET_NOISE, STEP_S, WALL_RADIUS
-from workers.environments.brax_parts import (
+from workers.environments import SHIPPED, Environment
+from workers.environments.ant_tasks import (
+    BODIES,
+    FORCE_LIMIT,
+    JOINTS,
+    MAZE_BOUNDS,
+    MAZE_GOAL,
+    MAZE_NEAR,
+    MAZE_START,
+    RESET_NOISE,
+    STEP_S,
+    TRAP_BEYOND_X,
+    TRAP_CONTACT_COST,
+    TRAP_CONTROL_COST,
+    TRAP_HEALTHY_Z,
+    TRAP_START,
+    TRAP_SURVIVAL_REWARD,
+    WALL_RADIUS,
+)
+from workers.environments.brax_task import (
     Contact,
     Motion,
     State,
@@ -241,3 +259,108 @@ def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
+
+
+# AntMaze: an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket.
+#
+# The arena, episode length and descriptor are those of the benchmark paper (Chalumeau et al. 2022); the inner walls,
+# the start and the goal are those of the original ME-ES task (Colas et al. 2020).
+
+MAZE_WALLS = SHIPPED["ant_maze"].walls or ()
+LOW, HIGH = MAZE_BOUNDS
+MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0
+"""Middle of the arena and half of its side; they scale positions in observations to [-1, 1]."""
+
+
+def ant_maze(physics: str = "spring") -> Environment:
+    """Functions of AntMaze.
+
+    Args:
+        physics: see `ant_in`.
+    """
+    ant = ant_in(physics, MAZE_WALLS)
+
+    def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = ant.step(state, action)
+        return state, -_goal_distance(state), jnp.array(False)
+
+    def reset(key: Any) -> Any:
+        return ant.reset(key, MAZE_START)
+
+    return Environment(reset, _observe_maze, step, _place, _goal_distance, _near_goal, ant.viewer)
+
+
+def _place(state: Any) -> Any:
+    return state.q[:2]
+
+
+def _observe_maze(state: Any) -> Any:
+    return jnp.concatenate([(_place(state) - MIDDLE) / HALF, observe(state)])
+
+
+def _goal_distance(state: Any) -> Any:
+    dx, dy = state.q[0] - MAZE_GOAL[0], state.q[1] - MAZE_GOAL[1]
+    return jnp.sqrt(dx * dx + dy * dy)
+
+
+def _near_goal(state: Any, before: Any) -> Any:
+    return _goal_distance(state) <= MAZE_NEAR
+
+
+# AntTrap: an ant is rewarded for running along +x, straight into a trap that is open on the side of the start.
+#
+# The numbers are those of the benchmark paper (Chalumeau et al. 2022) and of the QDax environment that it used: the
+# reward of Gym's ant with contact cost, observations with contact forces, and a trap 5 m wide and deep.
+
+TRAP_WALLS = SHIPPED["ant_trap"].walls or ()
+DESCRIPTOR_BOUNDS = SHIPPED["ant_trap"].descriptor_bounds
+
+
+def ant_trap(physics: str = "spring", contact_forces: str = "computed") -> Environment:
+    """Functions of AntTrap.
+
+    Args:
+        physics: see `ant_in`.
+        contact_forces: `computed`, as in Gym's ant and in the benchmark; or `zero` in observations and in the reward,
+            as with mujoco-py and MuJoCo 2, which did not compute them.
+    """
+    ant = ant_in(physics, TRAP_WALLS)
+
+    def forces(state: Any) -> Any:
+        return ant.contact_forces(state) if contact_forces == "computed" else jnp.zeros(6 * BODIES, jnp.float32)
+
+    def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
+        new = ant.step(state, action)
+        forward = (new.q[0] - state.q[0]) / STEP_S
+        # The cost is that of the clipped action, as the motors apply it: noise beyond the limits has no effect or cost.
+        control = TRAP_CONTROL_COST * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
+        contact = TRAP_CONTACT_COST * jnp.sum(forces(new) ** 2)
+        done = (new.q[2] < TRAP_HEALTHY_Z[0]) | (new.q[2] > TRAP_HEALTHY_Z[1])
+        return new, forward + TRAP_SURVIVAL_REWARD - control - contact, done
+
+    def reset(key: Any) -> Any:
+        return ant.reset(key, TRAP_START)
+
+    def observe_all(state: Any) -> Any:
+        return jnp.concatenate([_scaled_place(state), observe(state), forces(state)])
+
+    return Environment(reset, observe_all, step, _descriptor, _no_goal, _beyond, ant.viewer)
+
+
+def _scaled_place(state: Any) -> Any:
+    (x_low, x_high), (_, y_high) = DESCRIPTOR_BOUNDS
+    half = (x_high - x_low) / 2.0
+    return jnp.stack([(state.q[0] - x_low - half) / half, state.q[1] / y_high])
+
+
+def _descriptor(state: Any) -> Any:
+    low, high = (jnp.array(side, jnp.float32) for side in zip(*DESCRIPTOR_BOUNDS, strict=True))
+    return jnp.clip(state.q[:2], low, high)
+
+
+def _beyond(state: Any, before: Any) -> Any:
+    return before | (state.q[0] > TRAP_BEYOND_X)
+
+
+def _no_goal(state: Any) -> Any:
+    return jnp.float32(jnp.nan)

@@ -40,8 +40,15 @@ from es_service.protocol.options import OptionValue, declared_options
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.protocol.parameters import FREE, ParameterSpec
 from workers.environments import TaskError
-from workers.environments.declared import are_finite, clashes, construct, import_named, unknown_attributes, wrong_pairs
-from workers.environments.host_descriptors import finite_bounds
+from workers.environments.declared import (
+    are_finite,
+    clashes,
+    construct,
+    finite_bounds,
+    import_named,
+    unknown_attributes,
+    wrong_pairs,
+)
 
 PREFIX = "function:"
 SHOWN = 2

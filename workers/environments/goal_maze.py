@@ -16,12 +16,13 @@ import numpy as np
 from es_service.protocol.noise import uniforms
 from workers.environments import Environment
 from workers.environments.ant import make_ant, observe
-from workers.environments.ant_tasks import JOINTS, STEP_S
-from workers.environments.goal_cells import (
+from workers.environments.ant_tasks import (
     DRAWN,
     HEALTHY_Z,
+    JOINTS,
     NEAR_M,
     START,
+    STEP_S,
     bounds_of,
     cells_of,
     goals_of,

@@ -35,7 +35,7 @@ from es_service.protocol.raised import users_error, why_not_imported
 from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE, user_path
 from es_service.protocol.user_code import import_user_module
 from workers.environments import TaskError
-from workers.environments.host_descriptors import describe_descriptor
+from workers.environments.declared import describe_descriptor
 from workers.environments.host_metrics import missing_metrics, with_metrics
 from workers.environments.host_task import (
     LENGTH,

@@ -18,8 +18,8 @@ import numpy as np
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.options import Option, OptionValue
 from workers.environments import Environment, TaskError
-from workers.environments.brax_parts import quietly
-from workers.environments.host_descriptors import finite_bounds
+from workers.environments.brax_task import quietly
+from workers.environments.declared import finite_bounds
 from workers.environments.suite_task import (
     Actuators,
     Choices,

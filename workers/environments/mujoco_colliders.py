@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 
 with quietly():
     from mujoco.mjx._src import collision_driver, collision_primitive, math, types

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 
 with quietly():
     from mujoco import mjx

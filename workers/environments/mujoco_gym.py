@@ -22,7 +22,7 @@ import numpy as np
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.options import Option, OptionValue, choice
 from workers.environments import Environment, TaskError
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 from workers.environments.c_mujoco import ControlStep
 from workers.environments.gymnasium_task import gymnasium_package
 from workers.environments.host_task import action_bounds

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from workers.environments import TaskError
-from workers.environments.brax_parts import Transform, quietly
+from workers.environments.brax_task import Transform, quietly
 from workers.environments.mujoco_colliders import contacts_as_c
 from workers.environments.mujoco_contacts import AT_ONCE, solve
 from workers.viewer import Viewer

@@ -18,7 +18,7 @@ import numpy as np
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, choice
 from workers.environments import Environment, TaskError
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 from workers.environments.suite_task import (
     Actuators,
     Suite,

@@ -30,7 +30,7 @@ CORNER = (0.9, -0.9)
 """Start with the option `start="corner"`."""
 
 
-def make(start: str = "default") -> Environment:
+def point_maze(start: str = "default") -> Environment:
     """Functions of PointMaze, with the published random start or, for `start="corner"`, the fixed start (0.9, -0.9)."""
     reset = _reset_corner if start == "corner" else _reset
     return Environment(reset, _observe, _step, _observe, _goal_distance, lambda position, before: _at_goal(position))

@@ -44,6 +44,7 @@ from workers.environments.declared import (
     OF_EVERY_CLASS,
     are_finite,
     construct,
+    describe_descriptor,
     import_named,
     missing_names,
     task_of_class,
@@ -51,7 +52,6 @@ from workers.environments.declared import (
     wrong_pairs,
     wrong_values,
 )
-from workers.environments.host_descriptors import describe_descriptor
 from workers.environments.host_metrics import missing_metrics, with_metrics
 from workers.environments.host_task import (
     LENGTH,

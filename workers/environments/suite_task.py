@@ -31,7 +31,7 @@ from es_service.protocol.messages import UNBOUNDED, Bounds, TaskSpec
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import Option, OptionValue
 from workers.environments import Environment, TaskError
-from workers.environments.brax_parts import quietly
+from workers.environments.brax_task import quietly
 from workers.environments.host_task import action_bounds
 from workers.environments.keys import words_in_place_of_keys
 

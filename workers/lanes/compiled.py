@@ -27,8 +27,7 @@ from workers.simd.backend.native import ALIGNMENT, Words, aligned, pack, unpack,
 from workers.simd.backend.target import NoVectorsError
 from workers.simd.episodes.check import LANES, check_kernel, check_resets, reset_keys
 from workers.simd.episodes.kernel import Kernel, compile_kernel
-from workers.simd.graph.graph import Graph
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import Graph, UnsupportedError
 
 LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint32], LaneResults]]
 """Function of lanes and their reset keys [M, 4] -> (words of their carries [M, words], what is seen in them)."""

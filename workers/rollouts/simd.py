@@ -83,7 +83,7 @@ class Simd(RolloutBackend):
         return the_gpu().name
 
     def made(self, recipes: Recipes) -> FloatArray:
-        from workers.simd.episodes.variation import make_variation
+        from workers.simd.episodes.noise import make_variation
 
         return make_variation()(recipes)
 

@@ -36,8 +36,7 @@ from es_service.search.arrays import read_only
 from es_service.search.maps.behaviour_map import BehaviourMap, changed, insert
 from es_service.search.maps.geometry import cell_count
 from es_service.search.novelty import NoveltyArchive, empty_archive, extended, novelty
-from es_service.search.objectives import utilities, weight_of_fitness, weighted
-from es_service.search.shaping import pair_weights
+from es_service.search.shaping import pair_weights, utilities, weight_of_fitness, weighted
 from es_service.search.steps import STEPS, fresh_state
 
 CENTRE_CHOICE = 0

@@ -55,7 +55,7 @@ from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.objectives import weight_of_fitness
+from es_service.search.shaping import weight_of_fitness
 
 MODE_CHOICE, CELL_CHOICE = 1, 2
 """Last ids of the random streams of Domain.SELECTION: for what a block does, and for the cell where it starts."""

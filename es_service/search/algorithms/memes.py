@@ -50,7 +50,7 @@ from es_service.search.algorithms.common import (
 from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
-from es_service.search.objectives import weight_of_fitness
+from es_service.search.shaping import weight_of_fitness
 
 RESET_CHOICE = 4
 """Last id of the random stream of Domain.SELECTION that draws the cells from which emitters begin again."""

@@ -34,8 +34,7 @@ from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, 
 from es_service.search.algorithms.common import novelty_search, population
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
-from es_service.search.objectives import values, weight_of_fitness
-from es_service.search.shaping import centred_ranks
+from es_service.search.shaping import centred_ranks, values, weight_of_fitness
 
 LEFT, SCORE = "left", "score"
 """Names of the search's own arrays [screened]: whether each policy is still a candidate, and its score in the round."""

@@ -24,7 +24,7 @@ from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, target_of
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
-from workers.simd.episodes.layout import plan
+from workers.simd.episodes.hidden import plan
 from workers.simd.episodes.low_rank import make_low_rank_gradient_sum
 from workers.simd.episodes.noise import UNROLLED, fill_function
 

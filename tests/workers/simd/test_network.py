@@ -16,9 +16,8 @@ from tests.workers.simd.rollouts import every_target
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import aligned, load_compiled
 from workers.simd.backend.target import Target
-from workers.simd.episodes import layout
-from workers.simd.episodes.hidden import keep_function
-from workers.simd.episodes.layout import Network, plan
+from workers.simd.episodes import hidden
+from workers.simd.episodes.hidden import Network, keep_function, plan
 from workers.simd.episodes.network import policy_function
 from workers.simd.episodes.noise import fill_function
 
@@ -106,7 +105,7 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
     given = network, target, tmp_path, centre_D, x.reshape(-1, 5), np.ones(target.width, np.int32), keys
     assert network.keeps_weights
     kept, _ = run(*given)
-    monkeypatch.setattr(layout, "KEPT_BYTES", 0)
+    monkeypatch.setattr(hidden, "KEPT_BYTES", 0)
     assert not network.keeps_weights
     made, _ = run(*given)
     np.testing.assert_array_equal(kept, made)

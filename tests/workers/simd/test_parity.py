@@ -27,12 +27,12 @@ from tests.workers.steps import (
     substeps_of,
     whole,
 )
-from workers.environments import SHIPPED, ant_maze, ant_trap, describe_environment
+from workers.environments import SHIPPED, ant, describe_environment
 from workers.simd.episodes.kernel import compile_kernel
 
 STEPS = 30
 """Random control steps after which states are taken, at the latest."""
-WALLS = {"ant_maze": ant_maze.WALLS, "ant_trap": ant_trap.WALLS}
+WALLS = {"ant_maze": ant.MAZE_WALLS, "ant_trap": ant.TRAP_WALLS}
 
 
 def random_states(name: str, count: int) -> tuple[Any, np.ndarray]:

@@ -16,7 +16,7 @@ from jax import lax
 from tests.workers.simd.primitive_cases import CASES
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.tracer import PRIMITIVES
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 
 def check(function: Callable, arguments: list[np.ndarray]) -> None:

@@ -20,7 +20,7 @@ from workers.simd.episodes import check, noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.indexing import MOST_CHOICES
 from workers.simd.frontend.tracer import PRIMITIVES
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 
 def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPatch):

@@ -18,7 +18,7 @@ from workers.simd.backend.target import host_target
 from workers.simd.episodes import rollout
 from workers.simd.episodes.kernel import compile_kernel, compile_resets
 from workers.simd.frontend.tracer import PRIMITIVES
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 
 class Drift:

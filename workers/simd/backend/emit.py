@@ -11,10 +11,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.target import Target
-from workers.simd.graph.graph import Graph
+from workers.simd.graph.graph import Graph, UnsupportedError, refusing
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import Region, schedule
-from workers.simd.graph.unsupported import UnsupportedError, refusing
 
 MOST_SLOTS = 16384
 """Most vectors in the memory of a block, one MiB; this memory is on the stack."""

@@ -33,8 +33,8 @@ from workers.simd.backend.native import (
     words_of,
 )
 from workers.simd.backend.target import Target, host_target
+from workers.simd.episodes.hidden import Network
 from workers.simd.episodes.kernel import Check, compile_resets, no_check
-from workers.simd.episodes.layout import Network
 from workers.simd.episodes.low_rank import BlockNoise
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
 

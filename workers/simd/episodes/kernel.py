@@ -29,9 +29,8 @@ from workers.simd.backend.native import (
 )
 from workers.simd.backend.target import Target, host_target
 from workers.simd.frontend.trace import draws, jaxpr_digest, trace_jaxpr
-from workers.simd.graph.graph import Graph, live
+from workers.simd.graph.graph import Graph, UnsupportedError, live
 from workers.simd.graph.operations import OPERATIONS
-from workers.simd.graph.unsupported import UnsupportedError
 
 DRAWN = "random numbers of JAX in a reset, which JAX draws itself"
 

@@ -32,7 +32,7 @@ from workers.compilable import Compilable
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target
-from workers.simd.episodes.layout import Layer
+from workers.simd.episodes.hidden import Layer
 from workers.simd.episodes.noise import (
     UNROLLED,
     by_sign,

@@ -16,8 +16,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from workers.simd.backend.function_builder import FunctionBuilder, Values
-from workers.simd.episodes.hidden import View, activated, first_sums, per_lane, perturbed, shared, units
-from workers.simd.episodes.layout import Network
+from workers.simd.episodes.hidden import Network, View, activated, first_sums, per_lane, perturbed, shared, units
 from workers.simd.episodes.low_rank import BlockNoise, begins_of_hidden, begins_of_last, thin_sums
 from workers.simd.episodes.noise import by_sign, noise_of_weights
 

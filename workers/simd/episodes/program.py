@@ -25,8 +25,7 @@ from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.native import words_of
 from workers.simd.backend.target import Target
-from workers.simd.episodes.hidden import keep_function
-from workers.simd.episodes.layout import Network, plan
+from workers.simd.episodes.hidden import Network, keep_function, plan
 from workers.simd.episodes.low_rank import BlockNoise, plan_noise
 from workers.simd.episodes.network import Weights, policy_function, singles_function
 from workers.simd.episodes.noise import definition, fill_function

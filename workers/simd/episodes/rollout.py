@@ -26,11 +26,10 @@ from workers.simd.backend.native import Native, aligned, load_compiled, require
 from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
-from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
+from workers.simd.episodes.noise import UNROLLED, definition, gradient_module, make_variation
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
-from workers.simd.episodes.variation import make_variation
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.unsupported import UnsupportedError, fault
+from workers.simd.graph.graph import UnsupportedError, fault
 
 KEPT_PACKED = 4
 """Number of centres whose packed weights are kept, for work items that share centres."""

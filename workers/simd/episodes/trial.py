@@ -31,10 +31,9 @@ from workers.simd.episodes.kernel import DRAWN
 from workers.simd.episodes.rollout import training_program, why_not
 from workers.simd.frontend.trace import draws, jaxpr_digest, trace_jaxpr
 from workers.simd.frontend.tracer import line_of
-from workers.simd.graph.graph import Graph, reached
+from workers.simd.graph.graph import Graph, UnsupportedError, fault, reached
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import evaluate
-from workers.simd.graph.unsupported import UnsupportedError, fault
 
 ACTIONS: dict[str, Callable[[int, int], Any]] = {
     "of 0": lambda size, step: np.zeros(size),

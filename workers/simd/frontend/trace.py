@@ -16,7 +16,7 @@ import workers.simd.frontend.primitives  # noqa: F401 - registers the rules
 from workers.simd.frontend.primitives.random import partitionable
 from workers.simd.frontend.tracer import Tracer, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
-from workers.simd.graph.unsupported import UnsupportedError, refusing
+from workers.simd.graph.graph import UnsupportedError, refusing
 
 
 def draws(closed: ClosedJaxpr) -> bool:

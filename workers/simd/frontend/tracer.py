@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from es_service.protocol.raised import is_users_file
 from workers.simd.graph.folding import FoldingGraph
+from workers.simd.graph.graph import UnsupportedError, refusing, way_round
 from workers.simd.graph.loops import build_loop, build_while
-from workers.simd.graph.unsupported import UnsupportedError, refusing, way_round
 
 
 @functools.cache

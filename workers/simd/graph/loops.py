@@ -12,8 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from workers.simd.graph.graph import Graph, Loop, depending, live
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import Graph, Loop, UnsupportedError, depending, live
 
 Body = Callable[[list[int]], list[int]]
 UNROLLED_OPERATIONS = 2000

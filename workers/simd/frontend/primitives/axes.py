@@ -20,8 +20,7 @@ from workers.simd.frontend.tracer import (
     is_signed,
     primitive,
 )
-from workers.simd.graph.graph import Graph
-from workers.simd.graph.unsupported import UnsupportedError, way_round
+from workers.simd.graph.graph import Graph, UnsupportedError, way_round
 
 
 def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> PrimitiveRule:

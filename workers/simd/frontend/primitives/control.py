@@ -9,7 +9,7 @@ import numpy as np
 
 from workers.simd.frontend.primitives.elementwise import select
 from workers.simd.frontend.tracer import Nodes, Tracer, dtype_in, primitive
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import UnsupportedError
 
 MOST_TRIPS = 10_000
 """Most trips of a while loop, or of a scan with inputs or outputs per step; both become straight code."""

@@ -20,8 +20,7 @@ from workers.simd.frontend.tracer import (
     primitive,
 )
 from workers.simd.graph import elementary
-from workers.simd.graph.graph import Graph
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.graph import Graph, UnsupportedError
 
 
 def _by_dtype(floats: str | None, integers: str | None, booleans: str | None = None) -> PrimitiveRule:

@@ -17,7 +17,7 @@ from jax import lax
 
 from workers.simd.frontend.primitives.elementwise import extreme_of
 from workers.simd.frontend.tracer import PRIMITIVES, Nodes, Tracer, dtype_in, graph_dtype, is_signed, primitive
-from workers.simd.graph.unsupported import UnsupportedError, way_round
+from workers.simd.graph.graph import UnsupportedError, way_round
 
 
 @primitive("broadcast_in_dim")
