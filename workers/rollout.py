@@ -29,7 +29,7 @@ from workers.episode import Carry, episode_steps
 from workers.policies.pairs import act_in_pairs, act_low_rank
 from workers.policies.policy import act, split_layers
 
-Policies = Callable[[Any, Any], tuple[Any, Any]]
+ActOfLanes = Callable[[Any, Any], tuple[Any, Any]]
 """Function (memory_L_H, observation_L_O) -> (outputs_L_A, memory_L_H) of the policies of all lanes, as `act`."""
 
 
@@ -177,14 +177,14 @@ def make_low_rank_gradient_sum(policy: PolicySpec, rank: int) -> Compilable:
     return jitted(gradient_sum)
 
 
-def _act_each(policy: PolicySpec, parameters_L_D: Any) -> Policies:
+def _act_each(policy: PolicySpec, parameters_L_D: Any) -> ActOfLanes:
     """The policies of lanes that each have their own parameters."""
     layers = jax.vmap(partial(split_layers, policy))(parameters_L_D)  # inside a loop this would copy them in every step
     acts = jax.vmap(partial(act, jnp, policy))
     return lambda memory_L_H, observation_L_O: acts(layers, memory_L_H, observation_L_O)
 
 
-def _act_shared(policy: PolicySpec, parameters_D: Any) -> Policies:
+def _act_shared(policy: PolicySpec, parameters_D: Any) -> ActOfLanes:
     """The policies of lanes that share their parameters."""
     layers = split_layers(policy, parameters_D)
     acts = jax.vmap(partial(act, jnp, policy), in_axes=(None, 0, 0))
@@ -227,7 +227,7 @@ def _make_episodes(
     observe = jax.vmap(steps.normalised_observation, in_axes=(0, of_statistics, of_statistics))
     advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0, 0))
 
-    def episodes(policies: Policies, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
+    def episodes(policies: ActOfLanes, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
 
         def keep(seen_T: Carry | None, step: Any, carry: Carry) -> Carry | None:

@@ -395,7 +395,7 @@ GUIDES = {
 """Guide -> its file in a clone, and in an installed package where that is another."""
 
 
-class Section(NamedTuple):
+class GuideSection(NamedTuple):
     """A heading of a guide, and what stands below it."""
 
     guide: str
@@ -406,7 +406,7 @@ class Section(NamedTuple):
     """From the heading to the next one of the same or a higher level."""
 
 
-def sections() -> list[Section]:
+def sections() -> list[GuideSection]:
     """Of all guides that are here, in their order."""
     found = []
     for guide, files in GUIDES.items():
@@ -417,11 +417,11 @@ def sections() -> list[Section]:
             level = len(heading[1])
             later = (other.start() for other in headings[number + 1 :] if len(other[1]) <= level)
             plain = re.sub(r"`|\[([^\]]*)\]\([^)]*\)", r"\1", heading[2])
-            found.append(Section(guide, level, plain, text[heading.start() : next(later, len(text))]))
+            found.append(GuideSection(guide, level, plain, text[heading.start() : next(later, len(text))]))
     return found
 
 
-def named(topic: str, of: list[Section]) -> list[Section]:
+def named(topic: str, of: list[GuideSection]) -> list[GuideSection]:
     """Sections whose headings have all words of a topic, the shortest heading first."""
     words = topic.lower().split()
     found = [section for section in of if all(word in section.heading.lower() for word in words)]

@@ -23,7 +23,7 @@ from es_service.protocol.content import as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.report.measures import with_derived
-from es_service.report.series import IN_EVERY_RUN, Columns
+from es_service.report.series import IN_EVERY_RUN, HistoryColumns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
 from es_service.runs.run_status import RunStatus, group_of, status_at
 from es_service.runs.snapshot import sizes_of, sound_meta
@@ -43,9 +43,9 @@ class RunData:
     folder: Path
     meta: RunMeta
     task: TaskSpec
-    history: Columns
+    history: HistoryColumns
     """Columns of the history, [G], and those of certifications; a damaged row is left out."""
-    centres: Columns
+    centres: HistoryColumns
     """Columns of the evaluated centres, [N], in the order of the asks: `generation`, and those of the run."""
     map: BehaviourMap | None
     """None if the run has no map, or if it cannot be read."""

@@ -23,7 +23,7 @@ from es_service.report.series import phase_seconds
 from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
 from es_service.runs.identity import code_changes
 from es_service.runs.run_status import invalid_members, objectives, population_size, state, weights
-from es_service.runs.selection import Measure
+from es_service.runs.selection import RankedBy
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.settings import UndeclaredSettings
 
@@ -72,7 +72,7 @@ def _elsewhere(data: RunData) -> str:
     )
 
 
-def elsewhere_text(policy: Certified, measure: Measure) -> str:
+def elsewhere_text(policy: Certified, measure: RankedBy) -> str:
     """The value of a certified policy in another task, and its gap to that in the run's task, in words."""
     row = policy.row()
     value, gap = (

@@ -21,12 +21,11 @@ from es_service.report import floor
 from es_service.report.curves import axis_lines
 from es_service.report.data import RunData
 from es_service.report.facts import number
-from es_service.report.floor import detours
+from es_service.report.floor import Range, detours
 from es_service.report.markup import LEVELS, SCALE, Frame, Markup, joined, level, packed, spread, tag, value_range
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import Cvt, Grid, intervals
 
-Range = tuple[float, float]
 SMALL = 250
 """Width of a figure when several are shown side by side."""
 PAIRED_DIMENSIONS = 4

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from es_service.config.text import did_you_mean, nearest
 from es_service.errors import ConfigError
 from es_service.loop.history import CORRECTED, METRIC
-from es_service.report.series import Columns
+from es_service.report.series import HistoryColumns
 from es_service.runs.certified import measure_of
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def has_values(run: RunData, column: str) -> bool:
     return bool(np.isfinite(run.history.get(column, np.zeros(0))).any())
 
 
-def with_derived(history: Columns, certified: Sequence[Mapping[str, Any]], fitness: str) -> Columns:
+def with_derived(history: HistoryColumns, certified: Sequence[Mapping[str, Any]], fitness: str) -> HistoryColumns:
     """A history with the columns of certifications, in which corrected values and metrics hold until the next ones.
 
     Args:

@@ -84,7 +84,7 @@ def _best_until(fitness_N: np.ndarray, counts: list[int]) -> list[float]:
     return [float(best_N[count - 1]) if count else float("nan") for count in counts]
 
 
-Evaluate = Callable[[str], str]
+EvaluateText = Callable[[str], str]
 """Function from the name of a policy ("best", or a cell such as "3,17") to the text that evaluates it."""
 REPLAY = "replay"
 """Id of the section of replays."""
@@ -98,7 +98,7 @@ DETOUR_NOTE = (
 )
 
 
-def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | None = None) -> str:
+def run_page(data: RunData, evaluate: EvaluateText, replays: Mapping[str, Any] | None = None) -> str:
     """HTML of the report of a run.
 
     Args:
@@ -118,7 +118,7 @@ def run_title(data: RunData) -> str:
     return f"{data.name}: {data.constants['search.algorithm']} on {data.constants['task.environment']}"
 
 
-def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Markup], dict[str, Any]]:
+def run_sections(data: RunData, evaluate: EvaluateText | None) -> tuple[dict[str, Markup], dict[str, Any]]:
     """The sections of a run's page by their ids, in order (that of replays is empty), and the data of its script.
 
     Args:
@@ -217,7 +217,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     )
 
 
-def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> Markup:
+def _map(data: RunData, evaluate: EvaluateText | None, scripts: dict[str, Any]) -> Markup:
     if data.map is None:
         enabled = data.constants.get("map.enabled")
         text = "The map cannot be read." if enabled else "This run has no behaviour map (map.enabled is false)."

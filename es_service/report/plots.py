@@ -30,14 +30,14 @@ from es_service.search.maps.geometry import Grid, intervals
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Source = Run | RunData | str | os.PathLike[str]
-Several = list[Source] | list[RunData] | tuple[Source, ...]
+RunSource = Run | RunData | str | os.PathLike[str]
+Several = list[RunSource] | list[RunData] | tuple[RunSource, ...]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9", "#59626d")
 DASHES = ("-", "--", ":", "-.", (0, (3, 1)), (0, (8, 2)), (0, (6, 2, 1, 2, 1, 2)))
 WALL, PATH = "#1d2126", "#d55e00"
 
 
-def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
+def behaviour_map(run: RunSource, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
     """Draw the behaviour map of a run with a descriptor of one or two dimensions, with its walls and its goal.
 
     A cvt map of two dimensions has a hexagon for each elite, at the centroid of its cell. If the task has walls, it is
@@ -86,7 +86,7 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
     return axes.scatter(*place_N_2.T, c=map_.fitness_N, marker="h", zorder=1, **style)
 
 
-def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
+def centres(run: RunSource, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
     """Draw all evaluated centres, or policies, at the first two dimensions of their descriptors, coloured by fitness.
 
     With one dimension, the vertical axis is fitness. Where centres overlap, the fittest is seen.
@@ -113,7 +113,7 @@ def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None)
     )
 
 
-def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
+def trajectory(run: RunSource, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
     """Draw the path of an elite's first evaluation episode: a line through the points that the run stored.
 
     Where a wall is between two of them, the shortest way round it is dashed; see `es_service.report.floor`.
@@ -148,7 +148,7 @@ def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None,
 
 
 def curves(
-    runs: Source | Several,
+    runs: RunSource | Several,
     axes: Axes,
     column: str = "best_fitness",
     against: str = "env_steps",
@@ -217,7 +217,7 @@ def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: 
     _frame(axes, legend=True)
 
 
-def archive_profile(runs: Source | Several, axes: Axes, group_by: Sequence[str] = ()) -> None:
+def archive_profile(runs: RunSource | Several, axes: Axes, group_by: Sequence[str] = ()) -> None:
     """Draw archive profiles: the share of the cells of a map whose elite has at least each fitness.
 
     Of several runs, the median of each group, with its interval as in `curves`. Raises NotInRunError for a run without
@@ -239,7 +239,7 @@ def archive_profile(runs: Source | Several, axes: Axes, group_by: Sequence[str] 
     _frame(axes, legend=len(groups) > 1)
 
 
-def snapshots(run: Source, figure: Any, count: int = 4) -> Any:
+def snapshots(run: RunSource, figure: Any, count: int = 4) -> Any:
     """Draw the map of a run at equal intervals of its environment steps, side by side, the last at its end.
 
     Each map is that of all evaluated centres until then; see `several_maps.until`.
@@ -284,7 +284,7 @@ def _curve(axes: Axes, x_K: NDArray[np.float64], y_K: NDArray[np.float64], style
         line.set(marker="o", markersize=4, markevery=np.flatnonzero(lone_K).tolist())
 
 
-def _data(run: Source) -> RunData:
+def _data(run: RunSource) -> RunData:
     if isinstance(run, RunData):
         return run
     return read_run(run.folder if isinstance(run, Run) else given_path(run), paths=False, digest=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from es_service.loop.history import METRIC, evaluated_word
 from es_service.runs.run_status import objectives, weights
 
-Columns = Mapping[str, NDArray[np.float64]]
+HistoryColumns = Mapping[str, NDArray[np.float64]]
 """Column name -> its values; NaN stands for no value."""
 MOST_POINTS = 300
 """A curve of more generations shows groups of neighbouring ones."""
@@ -37,7 +37,7 @@ PHASES = {
 }
 """History columns that divide a generation's time -> labels."""
 
-Group = Literal["last", "mean", "held"]
+Thinning = Literal["last", "mean", "held"]
 """What a point shows of a group of generations: "last" for values so far, "mean" for values of one generation."""
 
 
@@ -66,7 +66,7 @@ class Chart(NamedTuple):
 class _Spec(NamedTuple):
     title: str
     note: str
-    lines: tuple[tuple[str, str, Group], ...]
+    lines: tuple[tuple[str, str, Thinning], ...]
     band: tuple[str, str, str] | None = None
     percent: bool = False
 
@@ -140,7 +140,7 @@ _SPECS = (
 )
 
 
-def charts(history: Columns, centres: Columns, qd_offset: float) -> list[Chart]:
+def charts(history: HistoryColumns, centres: HistoryColumns, qd_offset: float) -> list[Chart]:
     """The charts of a run that have values, from the columns of its history and of its evaluated centres.
 
     Args:
@@ -181,7 +181,7 @@ def charts(history: Columns, centres: Columns, qd_offset: float) -> list[Chart]:
     return chart_list
 
 
-def qd_columns(history: Columns, centres: Columns, qd_offset: float) -> tuple[Columns, str]:
+def qd_columns(history: HistoryColumns, centres: HistoryColumns, qd_offset: float) -> tuple[HistoryColumns, str]:
     """The QD-score counted from the least fitness that was evaluated, which does not fall as cells fill, and what is to
     be said of the stored one; nothing unless a fitness was below the offset.
 
@@ -196,7 +196,7 @@ def qd_columns(history: Columns, centres: Columns, qd_offset: float) -> tuple[Co
     return {QD_ABOVE_LEAST: history["qd_score"] + history["map_cells"] * (qd_offset - least)}, f"{below}least evaluated"
 
 
-def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Columns:
+def weight_columns(generation_G: NDArray[np.float64], centres: HistoryColumns) -> HistoryColumns:
     """What the centres of each generation climb; nothing if all weights of fitness are the same.
 
     Where each centre of the run either explores or exploits: the shares of both, `exploring` and `exploiting`. With a
@@ -218,7 +218,7 @@ def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Colum
     return {"exploring": 1.0 - mean_G, "exploiting": mean_G}
 
 
-def axes_of(history: Columns) -> dict[str, str]:
+def axes_of(history: HistoryColumns) -> dict[str, str]:
     """The axes of X_AXES that a run has."""
     return {
         column: label
@@ -227,18 +227,18 @@ def axes_of(history: Columns) -> dict[str, str]:
     }
 
 
-def x_axes(history: Columns) -> dict[str, NDArray[np.float64]]:
+def x_axes(history: HistoryColumns) -> dict[str, NDArray[np.float64]]:
     """Values of every axis of a run at the end of each group of generations, [K]."""
     ends_K = groups(len(history["generation"]))
     return {column: thinned(history[column], ends_K, "last") for column in axes_of(history)}
 
 
-def phase_seconds(history: Columns) -> dict[str, float]:
+def phase_seconds(history: HistoryColumns) -> dict[str, float]:
     """Seconds of each phase over the whole run, by label of PHASES."""
     return {label: float(np.nansum(history[column])) for column, label in PHASES.items() if column in history}
 
 
-def phase_curves(history: Columns) -> tuple[NDArray[np.float64], Mapping[str, NDArray[np.float64]]]:
+def phase_curves(history: HistoryColumns) -> tuple[NDArray[np.float64], Mapping[str, NDArray[np.float64]]]:
     """Generation at the end of each group [K], and by label of PHASES the mean seconds of a generation [K]."""
     ends_K = groups(len(history["generation"]))
     curves = {
@@ -255,7 +255,7 @@ def groups(generations: int) -> NDArray[np.int64]:
     return np.minimum(np.arange(1, -(-generations // size) + 1) * size, generations)
 
 
-def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Group) -> NDArray[np.float64]:
+def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Thinning) -> NDArray[np.float64]:
     """One value for each group, [K]: the last or the mean of its finite values; NaN for a group without any. held: the
     last finite value up to the end of the group, for values that only some generations have."""
     starts_K = np.concatenate([[0], ends_K[:-1]])

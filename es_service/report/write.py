@@ -16,7 +16,7 @@ from es_service.report.data import RunData, read_run
 from es_service.report.facts import verdict
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.markup import tag, value_range
-from es_service.report.page import Evaluate, document, run_page, run_title
+from es_service.report.page import EvaluateText, document, run_page, run_title
 from es_service.report.replays import MOST_CELLS, replay_section
 from es_service.runs.run_status import state
 from es_service.runs.view import Run
@@ -26,7 +26,7 @@ REPORT = "report.html"
 AnyPath = str | os.PathLike[str]
 
 
-def python_call(folder: Path) -> Evaluate:
+def python_call(folder: Path) -> EvaluateText:
     """The Python call that evaluates a policy of a run in new episodes."""
 
     def call(name: str) -> str:
@@ -44,7 +44,7 @@ def write_report(
     cells: Sequence[Sequence[int]] = (),
     certified: bool | None = None,
     trusted: bool = False,
-    evaluate: Evaluate | None = None,
+    evaluate: EvaluateText | None = None,
     figures: AnyPath | None = None,
 ) -> list[Path]:
     """Write the report of one run and return the files written, the page first.

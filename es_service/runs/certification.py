@@ -43,7 +43,7 @@ from es_service.runs.evaluation import Candidate, candidates, evaluation_config
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import code_of
 from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
-from es_service.runs.selection import MEASURES, Measure, halved, kept, results_of
+from es_service.runs.selection import RANKED_BY, RankedBy, halved, kept, results_of
 from es_service.runs.session import warn
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
@@ -57,7 +57,7 @@ TOP = 10
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedPolicy:
     """A candidate."""
 
     name: str
@@ -76,7 +76,7 @@ def certify_run(
     generation: int | None = None,
     episodes: int = EPISODES,
     keep: int = 1,
-    by: Measure | None = None,
+    by: RankedBy | None = None,
     task: str | None = None,
     overrides: Overrides = (),
     workers: int | None = None,
@@ -177,7 +177,7 @@ def certify(
     *,
     episodes: int = EPISODES,
     keep: int = 1,
-    by: Measure | None = None,
+    by: RankedBy | None = None,
     number: int = 0,
     observation_mean: ArrayLike | None = None,
     observation_std: ArrayLike | None = None,
@@ -209,17 +209,17 @@ def certify(
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
     spec, each = policy_spec(config, task), zip(policies_N_D, *statistics, strict=True)
-    given = [Named(str(index), Policy(spec, *arrays)) for index, arrays in enumerate(each)]
+    given = [NamedPolicy(str(index), Policy(spec, *arrays)) for index, arrays in enumerate(each)]
     return _certify(config, given, OTHER_PROGRAMS + number, episodes, keep, by, on_output)
 
 
 def _certify(
     config: RunConfig,
-    given: Sequence[Named],
+    given: Sequence[NamedPolicy],
     number: int,
     episodes: int,
     keep: int,
-    by: Measure | None,
+    by: RankedBy | None,
     on_output: Callable[[str], None],
     on_notice: Callable[[str], None] = lambda sentence: None,
     other: OtherTask | None = None,
@@ -273,11 +273,11 @@ def platform_of(config: RunConfig, other: OtherTask | None = None) -> dict[str, 
     return {**platform_info(), CODE: {file: sha256 for of in code for file, sha256 in of.items()}}
 
 
-def different(chosen: Sequence[Candidate]) -> list[Named]:
+def different(chosen: Sequence[Candidate]) -> list[NamedPolicy]:
     """The candidates; of equal policies only the first, since the best centre is often an elite as well."""
-    found: dict[bytes, Named] = {}
+    found: dict[bytes, NamedPolicy] = {}
     for candidate in chosen:
-        named = Named(candidate.name, candidate.policy, candidate.generation, candidate.stored_fitness)
+        named = NamedPolicy(candidate.name, candidate.policy, candidate.generation, candidate.stored_fitness)
         found.setdefault(candidate.policy.name, named)
     return list(found.values())
 
@@ -308,12 +308,12 @@ def outputs_of(task: TaskSpec) -> tuple[str, ...]:
     return ("last_reward", "success") if task.success else ("last_reward",)
 
 
-def _measure(config: RunConfig, by: Measure | None) -> Measure:
+def _measure(config: RunConfig, by: RankedBy | None) -> RankedBy:
     """What selection ranks by. Raises ConfigError if the task does not have it."""
     task = task_of(config)
     lacking = {"success": not task.success, "goal_distance": not task.has_goal}
-    if by is not None and (by not in MEASURES or lacking.get(by)):
-        allowed = [name for name in MEASURES if not lacking.get(name)]
+    if by is not None and (by not in RANKED_BY or lacking.get(by)):
+        allowed = [name for name in RANKED_BY if not lacking.get(name)]
         raise ConfigError(
             f"by = {by}: {config.task.environment} has no such measure; choose {', '.join(allowed)}",
             field="by",

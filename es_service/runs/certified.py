@@ -22,8 +22,8 @@ from es_service.loop.forms import BOOL, INTEGER, POLICY, REAL, array_problem
 from es_service.protocol.content import OF_POLICY, Policy, names, policy_of
 from es_service.protocol.noise import Domain, seed_for
 from es_service.runs.selection import (
-    Episodes,
-    Measure,
+    RankedBy,
+    StoredEpisodes,
     false_pass_share,
     gap_interval,
     interval_columns,
@@ -56,14 +56,14 @@ class Elsewhere:
     paired: bool
     """Whether episode e begins with the same observation in both tasks, for all e. If not, each task has drawn its own
     starts, and its episodes do not depend on those of the other."""
-    episodes: Episodes
+    episodes: StoredEpisodes
 
     @property
     def title(self) -> str:
         """`task_title` of the task and the options that were set."""
         return task_title(self.task, self.options)
 
-    def gaps(self, here: Episodes) -> dict[str, float | None]:
+    def gaps(self, here: StoredEpisodes) -> dict[str, float | None]:
         """How much higher each mean and the share of successes are than `here`, with intervals, by column name; None
         for what one of the tasks does not have."""
         columns: dict[str, float | None] = {}
@@ -96,7 +96,7 @@ class Certified:
     """Generation in which the run evaluated it."""
     stored_fitness: float | None
     """Fitness that the run stored for it: selected, not certified."""
-    selected_by: Measure
+    selected_by: RankedBy
     selection_mean: float | None
     """Mean of this measure over its selection episodes; None if it was the only candidate and had none."""
     selection_episodes: int
@@ -110,7 +110,7 @@ class Certified:
     """Number of this decision, from 1, or of those until the run was over; 0 if no decision belongs to it."""
     platform: Mapping[str, Any]
     """Packages, processor and code that computed it; see `runs.identity.changes_since`."""
-    episodes: Episodes
+    episodes: StoredEpisodes
     policy: Policy
     elsewhere: Elsewhere | None = None
     """The same policy in another task; None if it was not asked for."""
@@ -212,7 +212,7 @@ class CertifiedValue(NamedTuple):
     """What a certified policy does in a task, that of the run or another one."""
 
     policy: Certified
-    episodes: Episodes
+    episodes: StoredEpisodes
     """Its certification episodes in this task."""
 
 
@@ -262,7 +262,7 @@ def is_same_policy(one: Certified, other: Certified) -> bool:
     return one.policy.name == other.policy.name
 
 
-def measure_of(fitness: str) -> Measure:
+def measure_of(fitness: str) -> RankedBy:
     """What `task.fitness` says of an episode."""
     return "return" if fitness == "sum" else "last_reward"
 
@@ -316,7 +316,7 @@ def pairs_sentence(*, paired: bool) -> str:
     return "with the same starts in both tasks" if paired else "with starts of their own in each task"
 
 
-def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
+def arrays_of(episodes: StoredEpisodes) -> dict[str, NDArray[Any]]:
     """The arrays of episodes by name, for the store."""
     return {name: array for name, array in vars(episodes).items() if array is not None}
 
@@ -387,5 +387,5 @@ def _from_row(folder: Path, row: CertifiedRow, meta: RunMeta) -> Certified:
     return Certified(row.number, row.rank, **own, episodes=_episodes(of_episodes))
 
 
-def _episodes(arrays: Mapping[str, Any]) -> Episodes:
-    return Episodes(**{"success_E": None, **arrays})
+def _episodes(arrays: Mapping[str, Any]) -> StoredEpisodes:
+    return StoredEpisodes(**{"success_E": None, **arrays})

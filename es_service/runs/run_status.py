@@ -259,9 +259,9 @@ FAULTS_OF = 1000
 class Recent:
     """What happened in the recent generations of a run; None stands for what is not known."""
 
-    newest: Objectives | None = None
+    newest: Climbed | None = None
     """What the centres of the newest generation climb."""
-    objectives: Objectives | None = None
+    objectives: Climbed | None = None
     """What the centres of recent generations climb, the newest included."""
     lost_workers: int = 0
     retries: int = 0
@@ -305,7 +305,7 @@ def invalid_members(constants: Mapping[str, Any], invalid_G: Sequence[float], mo
     return f"{100 * last / members:.3g} % of the last generation"
 
 
-def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives, int]:
+def _objectives(run: Run, generation: int) -> tuple[Climbed, Climbed, int]:
     """What the centres of a generation climb, those of recent generations, this one included, and how many centres and
     policies the generation evaluated."""
     [newest] = read_evaluations(run.folder, generation, 1) or [[]]  # a driver that falls back may have deleted it
@@ -318,7 +318,7 @@ def _objectives(run: Run, generation: int) -> tuple[Objectives, Objectives, int]
     return objectives(of_generation), objectives(of_all), len(newest)
 
 
-class Objectives(NamedTuple):
+class Climbed(NamedTuple):
     """What some centres climb."""
 
     centres: int
@@ -335,10 +335,10 @@ class Objectives(NamedTuple):
         return min(self.exploring, self.exploiting) > 0 and self.exploring + self.exploiting == self.centres
 
 
-def objectives(weight_N: NDArray[np.float64]) -> Objectives:
+def objectives(weight_N: NDArray[np.float64]) -> Climbed:
     """What centres with these weights of fitness climb."""
     exploring, exploiting = (int((weight_N == alone).sum()) for alone in (0.0, 1.0))
-    return Objectives(weight_N.size, exploring, exploiting, float(weight_N.mean()) if weight_N.size else float("nan"))
+    return Climbed(weight_N.size, exploring, exploiting, float(weight_N.mean()) if weight_N.size else float("nan"))
 
 
 def weights(centres: Mapping[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

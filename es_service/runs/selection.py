@@ -25,13 +25,13 @@ FIRST_EPISODES = 16
 """Selection episodes of each candidate in the first round; each later round has twice as many as the one before."""
 
 
-Measure = Literal["return", "last_reward", "success", "goal_distance"]
+RankedBy = Literal["return", "last_reward", "success", "goal_distance"]
 """What selection episodes rank by; the least goal distance ranks by its negative, since higher is better."""
-MEASURES: tuple[Measure, ...] = get_args(Measure)
+RANKED_BY: tuple[RankedBy, ...] = get_args(RankedBy)
 
 
 @dataclass(frozen=True)
-class Episodes:
+class StoredEpisodes:
     """What is kept of episodes of a policy, whatever the run's `task.fitness` is."""
 
     return_E: NDArray[np.float64]
@@ -65,7 +65,7 @@ class Episodes:
             return float(self.fitness(kind).mean())
 
     @property
-    def measures(self) -> dict[Measure, NDArray[Any] | None]:
+    def measures(self) -> dict[RankedBy, NDArray[Any] | None]:
         """What each episode has of each measure, [E]; None for what the task does not have."""
         has_goal = not np.isnan(self.goal_distance_E).all()
         return {
@@ -91,14 +91,14 @@ class SelectionRecord:
     """A candidate with its selection episodes so far."""
 
     index: int
-    rounds: tuple[Episodes, ...] = ()
+    rounds: tuple[StoredEpisodes, ...] = ()
 
     @property
     def count(self) -> int:
         """Number of its selection episodes."""
         return sum(episodes.count for episodes in self.rounds)
 
-    def mean(self, by: Measure) -> float:
+    def mean(self, by: RankedBy) -> float:
         """Mean of a measure over all its episodes, higher is better; NaN without episodes."""
         values = {
             "return": lambda episodes: episodes.return_E,
@@ -111,7 +111,7 @@ class SelectionRecord:
         with np.errstate(invalid="ignore", over="ignore"):
             return float(np.concatenate([values(episodes) for episodes in self.rounds]).mean(dtype=np.float64))
 
-    def order(self, by: Measure) -> tuple[float, float]:
+    def order(self, by: RankedBy) -> tuple[float, float]:
         """Key by which the best is the first; a mean that is not finite comes last."""
         means = (self.mean(by), self.mean("return"))
         first, second = (-mean if math.isfinite(mean) else math.inf for mean in means)
@@ -119,7 +119,7 @@ class SelectionRecord:
 
 
 def halved(
-    engine: Evaluator, given: Sequence[Policy], seed: int, number: int, keep: int, by: Measure
+    engine: Evaluator, given: Sequence[Policy], seed: int, number: int, keep: int, by: RankedBy
 ) -> tuple[list[SelectionRecord], int]:
     """The `keep` best candidates by successive halving, best first, and the environment steps that it took.
 
@@ -143,7 +143,7 @@ def halved(
 
 def new_episodes(
     engine: Evaluator, policies: Sequence[Policy], episodes: int, seed: int, number: int, ask: int, domain: Domain
-) -> list[Episodes]:
+) -> list[StoredEpisodes]:
     """What is kept of new episodes of each policy; arguments as of `results_of`."""
     return [kept(result) for result in results_of(engine, policies, episodes, seed, number, ask, domain)]
 
@@ -170,9 +170,9 @@ def results_of(
     return [part_of(result, 0) for result in results]
 
 
-def kept(result: EpisodesResult) -> Episodes:
+def kept(result: EpisodesResult) -> StoredEpisodes:
     """What is kept of the results [E] of a policy."""
-    return Episodes(
+    return StoredEpisodes(
         result.returns.astype(np.float64),
         result.outputs["last_reward"].astype(np.float64),
         result.goal_distance[:, 1].astype(np.float64),

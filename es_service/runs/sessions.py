@@ -25,7 +25,7 @@ from es_service.protocol.content import Policy
 from es_service.protocol.evaluator import Session
 from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import require_no_import_of_a_task
-from es_service.runs.certification import Named, add_certified, different, opened, platform_of, workers_for
+from es_service.runs.certification import NamedPolicy, add_certified, different, opened, platform_of, workers_for
 from es_service.runs.certified import (
     EPISODES,
     Certified,
@@ -38,7 +38,7 @@ from es_service.runs.certified import (
 )
 from es_service.runs.checked_config import accepted, columns, require_resumable
 from es_service.runs.evaluation import candidates
-from es_service.runs.selection import Episodes, new_episodes
+from es_service.runs.selection import StoredEpisodes, new_episodes
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free
@@ -76,7 +76,7 @@ def certify_best(
     with opened(run, workers, on_notice) as (store, local), workers_for(local, on_notice, on_output) as engine:
         [best] = different(candidates(run, best=True, centre=False, cells=(), every=False))
 
-        def episodes_of(policy: Policy, number: int, domain: Domain) -> Episodes:
+        def episodes_of(policy: Policy, number: int, domain: Domain) -> StoredEpisodes:
             [episodes] = new_episodes(engine, [policy], EPISODES, config.seed, number, 0, domain)
             return episodes
 
@@ -94,12 +94,12 @@ def certify_best(
 
 def attempt(
     policies: Sequence[Certified],
-    best: Named,
+    best: NamedPolicy,
     number: int,
     target: float,
     fitness: str,
     platform: Mapping[str, Any],
-    episodes_of: Callable[[Policy, int, Domain], Episodes],
+    episodes_of: Callable[[Policy, int, Domain], StoredEpisodes],
 ) -> Iterator[Certified]:
     """What a run needs next: a decision on its best centre, unless one has passed already, and after a pass, the
     certified value of the policy that has passed.

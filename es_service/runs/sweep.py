@@ -33,7 +33,7 @@ from es_service.runs.certified import certified_over_time, target_reached
 from es_service.runs.run_status import INSIDE, recent_durations, write_groups
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.sweep_plan import Grid, Labelled, PlannedRun, plan
+from es_service.runs.sweep_plan import Labelled, PlannedRun, ValuesOfKeys, plan
 from es_service.runs.worker_count import shared
 from es_service.store.folder import explained, holds_run
 from es_service.store.lock import acquire_lock
@@ -63,7 +63,7 @@ class Certifying:
 
 
 @dataclass
-class Command:
+class RunCommands:
     """What a run of a sweep consists of, one command after another."""
 
     planned: PlannedRun
@@ -95,7 +95,7 @@ def command_of(
     inside: Path,
     options: Sequence[str],
     certifying: Certifying | None,
-) -> Command:
+) -> RunCommands:
     """The commands of a run. Its config is written now, so that an edited file does not reach runs that start later."""
     file = inside / f"{run.name}.yaml"
     try:
@@ -103,7 +103,7 @@ def command_of(
     except OSError as error:
         raise explained(error, inside, f"writing {file.name}", "start the sweep again") from error
     share = [] if workers == "auto" else ["--workers", str(workers)]
-    return Command(
+    return RunCommands(
         run,
         ["run", str(file), "--or-resume", "--out", str(run.folder), *options],
         ["evaluate", str(run.folder), "--certify", *share],
@@ -174,7 +174,7 @@ def sweep(
     config: Source | Sequence[Labelled],
     out: str | os.PathLike[str],
     *,
-    grid: Grid = MappingProxyType({}),
+    grid: ValuesOfKeys = MappingProxyType({}),
     seeds: Iterable[int] | None = None,
     overrides: Overrides = (),
     parallel: int | None = None,
@@ -290,7 +290,7 @@ def run_planned(
 class _Running:
     """A run whose command a process runs."""
 
-    command: Command
+    command: RunCommands
     process: Child
     log: Path
     """What its commands print, one after another."""
@@ -316,7 +316,7 @@ class _Running:
 
 
 def _start(
-    command: Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Running], idle: list[Child]
+    command: RunCommands, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Running], idle: list[Child]
 ) -> None:
     """Start the next command of a run, in a process that has ended another one, or a new one; the run has failed if
     that is impossible."""

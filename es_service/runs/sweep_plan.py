@@ -51,7 +51,7 @@ def _meaning_of_null(key: str) -> str:
 
 
 SEED, ENVIRONMENT = "seed", "task.environment"
-Grid = Mapping[str, Sequence[Any]]
+ValuesOfKeys = Mapping[str, Sequence[Any]]
 """Key of the config -> its values; a sweep has every combination of them."""
 _MOST_CHARACTERS = 60
 """Longest part of a run's name that is made of one value, since the name of a folder has at most 255 characters."""
@@ -97,7 +97,7 @@ def left_out_notes(planned: Sequence[PlannedRun]) -> list[str]:
 def plan(
     source: Source | Sequence[Labelled],
     out: Path,
-    grid: Grid = MappingProxyType({}),
+    grid: ValuesOfKeys = MappingProxyType({}),
     seeds: Iterable[int] | None = None,
     overrides: Overrides = (),
     *,

@@ -32,7 +32,7 @@ from es_service.runs.engine import engine_here
 from es_service.runs.evaluation import evaluation_config
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.other_task import stored_task
-from es_service.runs.selection import Episodes, new_episodes
+from es_service.runs.selection import StoredEpisodes, new_episodes
 from es_service.runs.session import initial_centres, initial_statistics
 from es_service.runs.view import Run
 from es_service.search.algorithms import ALGORITHMS
@@ -252,7 +252,7 @@ def _recomputed_elsewhere(
     return RecomputedCertification(policy, differences, changes_since(policy.platform, platform_of(config, other)), why)
 
 
-def _differing(engine: Evaluator, config: RunConfig, policy: Certified, then: Episodes) -> tuple[str, ...]:
+def _differing(engine: Evaluator, config: RunConfig, policy: Certified, then: StoredEpisodes) -> tuple[str, ...]:
     """Names of the results that differ from stored ones if the episodes of a certified policy are run again."""
     seed, domain = policy.resets(config.seed)
     [episodes] = new_episodes(engine, [policy.policy], then.count, seed, policy.number, 0, domain)

@@ -19,7 +19,7 @@ from es_service.errors import ServiceError, StoreError
 from es_service.report.data import RunData, followed, run_data
 from es_service.runs.certified import Certified, certified_elsewhere, measure_of, newest_certified
 from es_service.runs.run_status import RunStatus, read_status
-from es_service.runs.selection import Measure
+from es_service.runs.selection import RankedBy
 from es_service.runs.view import open_run
 from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run, leads_out
 from es_service.store.lock import lock_holder
@@ -56,7 +56,7 @@ class RunSummary(NamedTuple):
     """Why it cannot be read; empty if it can."""
 
     @property
-    def measure(self) -> Measure:
+    def measure(self) -> RankedBy:
         """What `task.fitness` says of an episode of a run that can be read."""
         assert self.status is not None
         return measure_of(self.status.run.constants["task.fitness"])

@@ -36,7 +36,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from es_service.errors import ConfigError, ServiceError
 from es_service.report.data import RunData
 from es_service.report.maps import path_lines
-from es_service.report.page import Evaluate, asset
+from es_service.report.page import EvaluateText, asset
 from es_service.report.replays import replay_section
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.view import open_run
@@ -135,7 +135,7 @@ T = TypeVar("T")
 class Site:
     """The live page of the runs below some folders."""
 
-    def __init__(self, roots: Sequence[Path], evaluate: Callable[[Path], Evaluate], *, trusted: bool) -> None:
+    def __init__(self, roots: Sequence[Path], evaluate: Callable[[Path], EvaluateText], *, trusted: bool) -> None:
         """`evaluate`: what evaluates a policy of a run's folder, as text. `trusted`: see `replay_section`."""
         self._runs, self._evaluate, self._trusted = Runs(roots), evaluate, trusted
         self._channels: dict[str, PageChannel] = {}
@@ -287,7 +287,7 @@ async def _answer(threads: ThreadPoolExecutor, work: Callable[[], T]) -> T:
 
 def serve(
     roots: Sequence[Path],
-    evaluate: Callable[[Path], Evaluate],
+    evaluate: Callable[[Path], EvaluateText],
     on_start: Callable[[str], None],
     *,
     host: str,

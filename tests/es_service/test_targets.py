@@ -16,7 +16,7 @@ from es_service.protocol.noise import Domain
 from es_service.report.data import read_run
 from es_service.report.facts import what_was_run
 from es_service.runs import run_status, sessions
-from es_service.runs.certification import Named, certify_run
+from es_service.runs.certification import NamedPolicy, certify_run
 from es_service.runs.certified import (
     EPISODES,
     Certified,
@@ -26,7 +26,7 @@ from es_service.runs.certified import (
     target_reached,
     tries_sentence,
 )
-from es_service.runs.selection import Episodes, false_pass_share, mean_interval
+from es_service.runs.selection import StoredEpisodes, false_pass_share, mean_interval
 from es_service.runs.sweep import INSIDE, run_planned
 from es_service.runs.sweep_plan import plan
 from tests.helpers import policy_with
@@ -258,7 +258,7 @@ def made_up_episodes(kind, rng, mean):
     }[kind]()
     success_E = shape > 0.5 if kind == "yes/no" else None
     nan_E = np.full(EPISODES, np.nan)
-    return Episodes(shape, shape, nan_E, success_E, np.ones(EPISODES, np.int64), np.zeros((EPISODES, 2)))
+    return StoredEpisodes(shape, shape, nan_E, success_E, np.ones(EPISODES, np.int64), np.zeros((EPISODES, 2)))
 
 
 def test_how_easily_a_run_ends_by_luck_is_said_with_the_number_of_its_tries():
@@ -285,7 +285,7 @@ def test_the_interval_of_what_ends_a_run_holds_the_truth_in_95_of_100_made_up_ru
                 return made_up_episodes(kind, np.random.default_rng([run, number, domain]), truth)
 
             assert sessions.due_after(policies, target, "sum")({"best_fitness": fitness})
-            best = Named("best", policy_with(np.array([tried], np.float32)), tried, fitness)
+            best = NamedPolicy("best", policy_with(np.array([tried], np.float32)), tried, fitness)
             policies += sessions.attempt(policies, best, len(policies), target, "sum", {}, episodes_of)
             if not policies[-1].decides:
                 break

@@ -14,7 +14,7 @@ RESULTS = {
     "es_service.search.algorithms.base.CentreEvaluation": "means over them, which a search is told",
     "es_service.search.algorithms.base.CentreEvaluations": "the same in columns",
     "es_service.runs.evaluator.PolicyEvaluations": "public: what `evaluator` returns",
-    "es_service.runs.selection.Episodes": "as stored with a certification, in float64",
+    "es_service.runs.selection.StoredEpisodes": "as stored with a certification, in float64",
     "es_service.runs.evaluation.Fresh": "moments over any number of them",
     "es_service.protocol.recordings.Recording": "one episode with its poses, for replays",
 }

@@ -35,7 +35,7 @@ from es_service.runs.evaluation import evaluation_config
 from es_service.runs.onnx import model_card
 from es_service.runs.other_task import other_task
 from es_service.runs.replay import record
-from es_service.runs.selection import Episodes, gap_interval, mean_interval, share_gap_interval
+from es_service.runs.selection import StoredEpisodes, gap_interval, mean_interval, share_gap_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
 from es_service.watch.pages import draw_list, metrics
@@ -352,7 +352,7 @@ def test_intervals_of_gaps_are_those_of_the_tables():
 def test_a_policy_that_is_invalid_in_all_episodes_of_another_task_has_no_numbers_there_and_is_shown(finished):
     def episodes(value):
         ones = np.ones(4)
-        return Episodes(value * ones, value * ones, np.nan * ones, None, ones.astype(np.int64), ones[:, None])
+        return StoredEpisodes(value * ones, value * ones, np.nan * ones, None, ones.astype(np.int64), ones[:, None])
 
     there = Elsewhere("point_maze", {}, None, "xla", True, episodes(np.nan))
     itself = policy_with(np.zeros(1, np.float32))

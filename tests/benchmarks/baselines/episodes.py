@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from es_service.protocol.noise import Domain, evaluation_reset_keys
 from es_service.runs.certification import EPISODES, OTHER_PROGRAMS
-from es_service.runs.selection import Episodes
+from es_service.runs.selection import StoredEpisodes
 from workers.lanes import Lanes
 
 Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Function from observations [E, O] to actions [E, A]."""
 
 
-def certification_episodes(policy: Policy, task: str, seed: int, number: int = 0, count: int = EPISODES) -> Episodes:
+def certification_episodes(
+    policy: Policy, task: str, seed: int, number: int = 0, count: int = EPISODES
+) -> StoredEpisodes:
     """Fresh episodes of a policy, with the resets that `es_service.certify` gives a single candidate.
 
     Args:
@@ -52,4 +54,4 @@ def certification_episodes(policy: Policy, task: str, seed: int, number: int = 0
             steps_E[alive_E] += 1
             alive_E &= ~seen.done
         success = success_E if lanes.task.success else None
-    return Episodes(return_E, last_reward_E, distance_E, success, steps_E, descriptor_E_B)
+    return StoredEpisodes(return_E, last_reward_E, distance_E, success, steps_E, descriptor_E_B)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 import es_service
 from es_service.protocol.machine import cpu_kind
 from es_service.runs.certification import EPISODES
-from es_service.runs.selection import Episodes
+from es_service.runs.selection import StoredEpisodes
 
 CHECKPOINT_S = 600.0
 """CPU seconds between checkpoints."""
@@ -75,7 +75,7 @@ class Facts:
 class Found:
     """The policy that a run has found, in certification episodes."""
 
-    episodes: Episodes
+    episodes: StoredEpisodes
     candidates: int
     """Number of policies from which selection episodes chose it; 1 if nothing was chosen."""
 

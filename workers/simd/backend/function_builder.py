@@ -34,7 +34,7 @@ attributes #0 = {{ {attributes} }}
 
 VALUE = re.compile(r"%v\d+")
 """The name of a value that an instruction has made."""
-Values = list[str]
+Names = list[str]
 """Names of values in LLVM IR."""
 
 
@@ -116,10 +116,10 @@ class FunctionBuilder:
     def loop(
         self,
         trips: str | int | None,
-        body: Callable[[str, Values], Iterable[str]],
+        body: Callable[[str, Names], Iterable[str]],
         carries: Sequence[tuple[str, str]] = (),
         until: Callable[[], str] | None = None,
-    ) -> Values:
+    ) -> Names:
         """Repeat a body; returns the carried values after the last trip, or the first ones if there is no trip.
 
         Args:

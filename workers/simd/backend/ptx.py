@@ -31,7 +31,7 @@ from typing import NamedTuple
 import llvmlite.binding as llvm
 
 from workers.simd.backend.emit import Writer
-from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.backend.native import code_generator
 from workers.simd.backend.target import Target
 from workers.simd.graph.schedule import Region
@@ -86,7 +86,7 @@ def lane_function(name: str, pointers: Sequence[Pointer], calls: Sequence[StepCa
     builder = FunctionBuilder(f"{name}_of_lane", [*parameters, "i64 %lanes", "i64 %steps", "i64 %lane"], target)
     first = {pointer.name: builder.at(f"%{pointer.name}", "%lane", "i32") for pointer in pointers if pointer.by_lane}
 
-    def step(number: str, _: Values) -> Values:
+    def step(number: str, _: Names) -> Names:
         places = {pointer.name: first.get(pointer.name, f"%{pointer.name}") for pointer in pointers}
         for pointer in pointers:
             if pointer.words_of_step:

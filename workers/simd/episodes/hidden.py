@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.policy_spec import Activation, Output, PolicySpec
 from workers.simd.backend.emit import inline
-from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.backend.native import ALIGNMENT, aligned
 from workers.simd.backend.target import Target
 from workers.simd.episodes.noise import noise_of_weights
@@ -178,7 +178,7 @@ def shared(
     layer: Layer,
     x: View,
     out: View,
-    begins: Callable[[str, str, Values], Values] = lambda first, tile, biases: biases,
+    begins: Callable[[str, str, Names], Names] = lambda first, tile, biases: biases,
 ) -> None:
     """Write out = f(centre x), for several members at a time.
 
@@ -189,14 +189,14 @@ def shared(
     members = min(builder.width, builder.target.sums_at_once // layer.tile)
     assert builder.width % members == 0
 
-    def tile(first: str, number: str) -> Values:
+    def tile(first: str, number: str) -> Names:
         weights = builder.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
 
-        def centre(row: str | int) -> Values:
+        def centre(row: str | int) -> Names:
             at = builder.index((weights, 1), (row, layer.tile))
             return [builder.load(floats, "%centre", builder.index((at, 1), (v, 1))) for v in range(layer.tile)]
 
-        def add(row: str, sums: Values) -> Values:
+        def add(row: str, sums: Names) -> Names:
             vectors, new_sums = centre(row), []
             for member in range(members):
                 seen = _seen(builder, x, first, member, row)
@@ -223,7 +223,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
     assert builder.width % (2 * pairs) == 0
     kept = builder.at("%noise", network.kept_at, "i8")
 
-    def tile(first: str, number: str) -> Values:
+    def tile(first: str, number: str) -> Names:
         weights = builder.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
         first_pair = builder.value(f"lshr i64 {first}, 1")
 
@@ -242,7 +242,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
                 of_plus = _weights_of_plus(builder, centre, places)
             return [(plus, builder.value(f"fsub {floats} {doubled}, {plus}")) for plus in of_plus]
 
-        def add(row: str, sums: Values) -> Values:
+        def add(row: str, sums: Names) -> Names:
             seen = [_seen(builder, x, first, member, row) for member in range(2 * pairs)]
             new_sums = list(sums)
             for v in range(layer.tile):
@@ -272,7 +272,7 @@ def keep_function(network: Network) -> FunctionBuilder:
     floats = builder.llvm_types["f"]
     kept = builder.at("%noise", network.kept_at, "i8")
 
-    def vector(at: str, _: Values) -> Values:
+    def vector(at: str, _: Names) -> Names:
         centre = builder.load(floats, "%centre", at)
         places = [builder.index((at, 1), (pair * network.vectors, 1)) for pair in range(network.width // 2)]
         for place, plus in zip(places, _weights_of_plus(builder, centre, places), strict=True):
@@ -283,7 +283,7 @@ def keep_function(network: Network) -> FunctionBuilder:
     return builder
 
 
-def _weights_of_plus(builder: FunctionBuilder, centre: str, places: Sequence[str]) -> Values:
+def _weights_of_plus(builder: FunctionBuilder, centre: str, places: Sequence[str]) -> Names:
     """Vectors of weights of + members, from a vector of the centre's weights and the places of the pairs' noise."""
     unit, twice = units(builder)
     moved = builder.value(f"fadd {builder.llvm_types['f']} {centre}, {unit}")
@@ -302,14 +302,14 @@ def per_lane(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None
     members = min(builder.width, most // wide.tile)
     assert builder.width % members == 0
 
-    def tile(first: str, number: str) -> Values:
+    def tile(first: str, number: str) -> Names:
         places = builder.index((number, (layer.inputs + 1) * wide.tile), (layer.first, 1))
         addresses = [
             builder.load("i64", "%weights", builder.index((first, 1), (member, 1))) for member in range(members)
         ]
         pointers = [builder.value(f"inttoptr i64 {address} to ptr") for address in addresses]
 
-        def weights(row: str | int) -> list[Values]:
+        def weights(row: str | int) -> list[Names]:
             """Vectors of the tile for input `row`, of each member; they follow each other in memory."""
             place = builder.load("i32", "%places", builder.index((places, 1), (row, layer.tile)))
             start = builder.value(f"zext i32 {place} to i64")
@@ -319,7 +319,7 @@ def per_lane(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None
                 for pointer in pointers
             ]
 
-        def add(row: str, sums: Values) -> Values:
+        def add(row: str, sums: Names) -> Names:
             new_sums = []
             for member, vectors in enumerate(weights(row)):
                 seen = _seen(builder, x, first, member, row)
@@ -336,10 +336,10 @@ def per_lane(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None
     _by_members(builder, wide, members, tile)
 
 
-def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Callable[[str, str], Values]) -> None:
+def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Callable[[str, str], Names]) -> None:
     """Write `tile(first member, number of the tile)` for each group of members of which at least one is alive."""
 
-    def block(number: str, _: Values) -> Values:
+    def block(number: str, _: Names) -> Names:
         first = builder.index((number, members))
         alive = builder.value(f"load <{members} x i32>, ptr {builder.at('%alive', first, 'i32')}, align 4")
         builder.when(builder.any(alive, members), lambda: builder.loop(layer.tiles, lambda t, _: tile(first, t)))
@@ -369,12 +369,12 @@ def _put(
         builder.store(builder.llvm_types["f"], value, out.pointer, place)
 
 
-def first_sums(bias: bool, biases: Values) -> Values:
+def first_sums(bias: bool, biases: Names) -> Names:
     """The vectors with which sums begin: the biases, or 0."""
     return biases if bias else ["zeroinitializer"] * len(biases)
 
 
-def activated(builder: FunctionBuilder, activation: Activation, values: Sequence[str]) -> Values:
+def activated(builder: FunctionBuilder, activation: Activation, values: Sequence[str]) -> Names:
     """Vectors of the activation of each vector."""
     graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(len(values))]

@@ -29,7 +29,7 @@ from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.policy_spec import PolicySpec
 from workers.compilable import Compilable
-from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target
 from workers.simd.episodes.hidden import Layer
@@ -102,12 +102,12 @@ def plan_noise(
     return BlockNoise(rank, spec.bias, tuple(first), tuple(left), right, len(vectors), places)
 
 
-def thin_sums(builder: FunctionBuilder, noise: BlockNoise, layer: int, inputs: int, x: str) -> Values:
+def thin_sums(builder: FunctionBuilder, noise: BlockNoise, layer: int, inputs: int, x: str) -> Names:
     """The vectors t of each rank, a member in each lane, of layer number `layer` with inputs x [input, lane]."""
     floats, rank, singles = builder.llvm_types["f"], noise.rank, noise.singles(builder)
     unit = builder.value(f"fmul float %unit, {float_constant(product_unit(rank))}")
 
-    def add(row: str, sums: Values) -> Values:
+    def add(row: str, sums: Names) -> Names:
         seen = builder.load(floats, x, row)
         places = [builder.index((row, rank), (noise.left[layer] + r, 1)) for r in range(rank)]
         return [
@@ -122,7 +122,7 @@ def thin_sums(builder: FunctionBuilder, noise: BlockNoise, layer: int, inputs: i
 
 def begins_of_hidden(
     builder: FunctionBuilder, noise: BlockNoise, layer: Layer, number: int, thin: str
-) -> Callable[[str, str, Values], Values]:
+) -> Callable[[str, str, Names], Names]:
     """Function (first member, tile, the centre's biases of each member and vector of the tile) -> first values of the
     sums of these members, for hidden layer `number`.
 
@@ -133,7 +133,7 @@ def begins_of_hidden(
     minus = builder.splat(builder.value("fneg float %unit"))
     rows = noise.rank + noise.bias
 
-    def begins(first: str, tile: str, biases: Values) -> Values:
+    def begins(first: str, tile: str, biases: Names) -> Names:
         first_pair, sums = builder.value(f"lshr i64 {first}, 1"), list(biases)
         for pair in range(len(biases) // layer.tile // 2):
             start = builder.index((first_pair, noise.vectors), (pair * noise.vectors + noise.first[number], 1))
@@ -157,8 +157,8 @@ def begins_of_hidden(
 
 
 def begins_of_last(
-    builder: FunctionBuilder, noise: BlockNoise, outputs: range, count: int, biases: Values, thin: Values
-) -> Values:
+    builder: FunctionBuilder, noise: BlockNoise, outputs: range, count: int, biases: Names, thin: Names
+) -> Names:
     """First values of the sums of some outputs of the last layer, a member in each lane.
 
     Args:
@@ -174,7 +174,7 @@ def begins_of_last(
     return sums
 
 
-def _moved(builder: FunctionBuilder, noise: BlockNoise, value: str, rows: Values, unit: str, factors: Values) -> str:
+def _moved(builder: FunctionBuilder, noise: BlockNoise, value: str, rows: Names, unit: str, factors: Names) -> str:
     """A sum before the inputs: the centre's bias, and what a member adds to it.
 
     Args:
@@ -253,10 +253,10 @@ def gradient_module(target: Target) -> str:
     of_numbers = builder.splat(float_constant(np.float32(1.0 / NORMAL_STD)))
     stride = builder.index(("%drawn", width))
 
-    def draw(pair: str, _: Values) -> Values:
+    def draw(pair: str, _: Names) -> Names:
         key, first = load_key(builder, "%keys", pair), builder.value(f"mul i64 {pair}, %drawn")
 
-        def vector(at: str, _: Values) -> Values:
+        def vector(at: str, _: Names) -> Names:
             start = builder.splat(builder.value(f"trunc i64 {builder.index((at, width))} to i32"), "i")
             coordinate = builder.value(f"add {builder.llvm_types['i']} {start}, {lanes(builder)}")
             k = noise_of(builder, key, coordinate, halved=False)
@@ -271,31 +271,31 @@ def gradient_module(target: Target) -> str:
         """Addresses of the vectors of a group, whose first number is at a place."""
         return [builder.at(pointer, builder.index((place, 1), (v * width, 1)), "float") for v in range(UNROLLED)]
 
-    def added(factor: str, place: str, sums: Values) -> Values:
+    def added(factor: str, place: str, sums: Names) -> Names:
         vectors = [builder.value(f"load {floats}, ptr {at}, align 4") for at in group_at("%rows", place)]
         return [builder.fma(builder.splat(factor), vector, total) for vector, total in zip(vectors, sums, strict=True)]
 
-    def write(scale: str, sums: Values, place: str) -> None:
+    def write(scale: str, sums: Names, place: str) -> None:
         for at, total in zip(group_at("%sums", place), sums, strict=True):
             builder.do(f"store {floats} {builder.value(f'fmul {floats} {total}, {scale}')}, ptr {at}, align 4")
 
     zeros = [(floats, "zeroinitializer")] * UNROLLED
 
-    def layer(number: str, _: Values) -> Values:
+    def layer(number: str, _: Names) -> Names:
         left, right, bias, inputs, outputs, start = (
             builder.load("i64", "%table", builder.index((number, TABLE), (place, 1))) for place in range(TABLE)
         )
         groups = builder.value(f"udiv i64 {builder.index((outputs, 1), (group - 1, 1))}, {group}")
 
-        def row(i: str, _: Values) -> Values:
+        def row(i: str, _: Names) -> Names:
             first = builder.index((start, 1), (builder.value(f"mul i64 {i}, {outputs}"), 1))
 
-            def block(j: str, _: Values) -> Values:
-                def add_pair(pair: str, sums: Values) -> Values:
+            def block(j: str, _: Names) -> Names:
+                def add_pair(pair: str, sums: Names) -> Names:
                     weight = builder.load("float", "%weights", pair)
                     of_pair = builder.value(f"mul i64 {pair}, {stride}")
 
-                    def add_rank(r: str, sums: Values) -> Values:
+                    def add_rank(r: str, sums: Names) -> Names:
                         at_left, at_right = (builder.value(f"mul i64 {r}, {size}") for size in (inputs, outputs))
                         a = builder.load("float", "%rows", builder.index((of_pair, 1), (left, 1), (at_left, 1), (i, 1)))
                         place = builder.index((of_pair, 1), (right, 1), (at_right, 1), (j, group))
@@ -312,8 +312,8 @@ def gradient_module(target: Target) -> str:
         def biases() -> None:
             first = builder.index((start, 1), (builder.value(f"mul i64 {inputs}, {outputs}"), 1))
 
-            def block(j: str, _: Values) -> Values:
-                def add_pair(pair: str, sums: Values) -> Values:
+            def block(j: str, _: Names) -> Names:
+                def add_pair(pair: str, sums: Names) -> Names:
                     of_pair = builder.value(f"mul i64 {pair}, {stride}")
                     place = builder.index((of_pair, 1), (bias, 1), (j, group))
                     return added(builder.load("float", "%weights", pair), place, sums)

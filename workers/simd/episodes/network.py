@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.episodes.hidden import Network, View, activated, first_sums, per_lane, perturbed, shared, units
 from workers.simd.episodes.low_rank import BlockNoise, begins_of_hidden, begins_of_last, thin_sums
 from workers.simd.episodes.noise import by_sign, noise_of_weights
@@ -71,7 +71,7 @@ def policy_function(network: Network, weights: Weights, low_rank: BlockNoise | N
         seen = buffers[len(network.hidden) % 2]
         _transpose(builder, view, network.inputs, seen)
 
-    def begins(outputs: range, biases: Values) -> Values:
+    def begins(outputs: range, biases: Names) -> Names:
         return begins_of_last(builder, low_rank, outputs, network.outputs, biases, thin) if low_rank else biases
 
     thin = thin_sums(builder, low_rank, len(network.hidden), network.inputs, seen) if low_rank else []
@@ -91,7 +91,7 @@ def singles_function(network: Network) -> FunctionBuilder:
     )
     floats = builder.llvm_types["f"]
 
-    def single(number: str, _: Values) -> Values:
+    def single(number: str, _: Names) -> Names:
         place = builder.load("i32", "%places", builder.index((number, 1), (network.vectors, 1)))
         place, vector = builder.value(f"zext i32 {place} to i64"), "poison"
         for lane in range(network.width):
@@ -111,7 +111,7 @@ def _last(
     x: str,
     outputs: range,
     weights: Weights,
-    begins: Callable[[range, Values], Values],
+    begins: Callable[[range, Names], Names],
 ) -> None:
     """Write action = f(weights x) for some outputs, with f = tanh or none; the lanes of a vector are members.
 
@@ -121,13 +121,13 @@ def _last(
     floats, count = builder.llvm_types["f"], network.outputs
     singles = "" if weights == "per_lane" else builder.at("%centre", network.vectors * builder.width, "float")
 
-    def centre(row: str | int) -> Values:
+    def centre(row: str | int) -> Names:
         return [
             builder.splat(builder.load("float", singles, builder.index((row, count), (output, 1))))
             for output in outputs
         ]
 
-    def per_lane_weights(row: str | int) -> Values:
+    def per_lane_weights(row: str | int) -> Names:
         return [builder.load(floats, "%singles", builder.index((row, count), (output, 1))) for output in outputs]
 
     of_row = per_lane_weights if weights == "per_lane" else centre
@@ -135,12 +135,12 @@ def _last(
         noise = builder.at("%noise", network.vectors * (builder.width // 2) * builder.width, "i8")
         unit, twice = (by_sign(builder, vector) for vector in units(builder))
 
-        def of_row(row: str | int) -> Values:
+        def of_row(row: str | int) -> Names:
             js = [noise_of_weights(builder, noise, builder.index((row, count), (output, 1))) for output in outputs]
             moved = [builder.value(f"fadd {floats} {weight}, {unit}") for weight in centre(row)]
             return [builder.fma(j, twice, weight) for j, weight in zip(js, moved, strict=True)]
 
-    def add(row: str, sums: Values) -> Values:
+    def add(row: str, sums: Names) -> Names:
         seen = builder.load(floats, x, row)
         return [builder.fma(seen, weight, total) for weight, total in zip(of_row(row), sums, strict=True)]
 
@@ -155,7 +155,7 @@ def _transpose(builder: FunctionBuilder, x: View, inputs: int, to: str) -> None:
     """Write the members' inputs x to `to` as [input, lane], in squares of as many inputs as lanes."""
     floats, width = builder.llvm_types["f"], builder.width
 
-    def square(number: str, _: Values) -> Values:
+    def square(number: str, _: Names) -> Names:
         rows = [
             builder.load(floats, x.pointer, builder.index((number, 1), (member * x.by_member // width, 1)))
             for member in range(width)

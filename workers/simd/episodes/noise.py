@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.recipes import FloatArray, IsoLine, Recipes, recipes_of
 from workers.simd.backend.emit import inline
-from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target
 from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
@@ -35,7 +35,7 @@ def definition() -> str:
     return f"{jaxpr_digest(_jaxpr())} {NORMAL_STD}"
 
 
-def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: bool) -> str:
+def noise_of(builder: FunctionBuilder, key: Names, coordinate: str, *, halved: bool) -> str:
     """Vector of integer noise k for vectors of key words and coordinates; if `halved`, of j in k = 2 j + 1."""
     graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
@@ -44,13 +44,13 @@ def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: 
     return inline(builder, graph, [output], given)[0]
 
 
-def load_key(builder: FunctionBuilder, keys: str, pair: str) -> Values:
+def load_key(builder: FunctionBuilder, keys: str, pair: str) -> Names:
     """Words of key number `pair`, as vectors with the word in all lanes."""
     words = [builder.load("i32", keys, builder.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
     return [builder.splat(word, "i") for word in words]
 
 
-def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
+def keys_of_members(builder: FunctionBuilder, keys: str) -> Names:
     """Words of the keys of as many members as there are lanes; the two members of a pair have the same key."""
     words = []
     for word in range(KEY_WORDS):
@@ -91,10 +91,10 @@ def fill_function(vectors: int, singles: int, target: Target) -> FunctionBuilder
     width = target.width
     bytes_ = f"<{width} x i8>"
 
-    def pair(number: str, _: Values) -> Values:
+    def pair(number: str, _: Names) -> Names:
         key = load_key(builder, "%keys", number)
 
-        def vector(at: str, _: Values) -> Values:
+        def vector(at: str, _: Names) -> Names:
             start = builder.splat(builder.load("i32", "%places", at), "i")
             coordinate = builder.value(f"add {builder.llvm_types['i']} {start}, {lanes(builder)}")
             keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, vectors), (at, 1)))
@@ -110,7 +110,7 @@ def fill_function(vectors: int, singles: int, target: Target) -> FunctionBuilder
         builder.loop(width // 2, pair)
     key = keys_of_members(builder, "%keys")
 
-    def single(number: str, _: Values) -> Values:
+    def single(number: str, _: Names) -> Names:
         coordinate = builder.splat(builder.load("i32", "%places", builder.index((number, 1), (vectors, 1))), "i")
         keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, 1), (width // 2 * vectors, 1)))
         return []
@@ -129,7 +129,7 @@ def gradient_module(target: Target) -> str:
     builder = FunctionBuilder("inside", parameters, target)
     width, floats = target.width, builder.llvm_types["f"]
 
-    def group(number: str, _: Values) -> Values:
+    def group(number: str, _: Names) -> Names:
         first = builder.value(f"trunc i64 {builder.index((number, UNROLLED * width))} to i32")
         start = builder.value(f"add {builder.llvm_types['i']} {builder.splat(first, 'i')}, {lanes(builder)}")
         coordinates = [
@@ -137,7 +137,7 @@ def gradient_module(target: Target) -> str:
             for vector in range(UNROLLED)
         ]
 
-        def add(pair: str, sums: Values) -> Values:
+        def add(pair: str, sums: Names) -> Names:
             key = load_key(builder, "%keys", pair)
             weight = builder.splat(builder.load("float", "%weights", pair))
             new_sums = []
@@ -226,11 +226,11 @@ def variation_module(target: Target) -> str:
     iso = builder.splat("%iso")
     end = builder.splat(builder.value("trunc i64 %parameters to i32"), "i")
 
-    def variate(key: Values, coordinate: str) -> str:
+    def variate(key: Names, coordinate: str) -> str:
         k = noise_of(builder, key, coordinate, halved=False)
         return builder.value(f"fdiv {floats} {builder.value(f'sitofp {integer} {k} to {floats}')}, {std}")
 
-    def policy(number: str, _: Values) -> Values:
+    def policy(number: str, _: Names) -> Names:
         key = load_key(builder, "%keys", number)
         x, y, out = (
             builder.value(f"inttoptr i64 {builder.load('i64', f'%{name}', number)} to ptr")
@@ -238,7 +238,7 @@ def variation_module(target: Target) -> str:
         )
         line = builder.value(f"fmul {floats} {builder.splat('%line')}, {variate(key, end)}")
 
-        def vector(at: str, _: Values) -> Values:
+        def vector(at: str, _: Names) -> Names:
             start = builder.index((at, width))
             is_last = builder.value(f"icmp sgt i64 {start}, {last}")
             start = builder.value(f"select i1 {is_last}, i64 {last}, i64 {start}")

@@ -22,7 +22,7 @@ from es_service.protocol.outputs import OF_STEPS
 from workers.environments import Environment
 from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
-from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import words_of
 from workers.simd.backend.target import Target
 from workers.simd.episodes.hidden import Network, keep_function, plan
@@ -168,7 +168,7 @@ def _module(
     seen, action = "%room", builder.at("%room", inputs, vector)
     hidden = builder.at("%room", inputs + actions, vector)
 
-    def block(number: str, _: Values) -> Values:
+    def block(number: str, _: Names) -> Names:
         carry = builder.at("%carries", builder.index((number, words)), vector)
         action_key = builder.at("%action_keys", builder.index((number, KEY_WORDS)), vector)
         alive = builder.at(carry, alive_word, vector)
@@ -189,7 +189,7 @@ def _module(
             for place, word in enumerate(kept):
                 builder.store(vector, builder.load(vector, carry, word), copies, place)
 
-        def step(number_of_step: str, _: Values) -> Values:
+        def step(number_of_step: str, _: Names) -> Names:
             builder.do(f"call void @look(ptr {carry}, ptr {constants}, ptr {seen})")
             builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr {policies}, {given}ptr {hidden}, ptr {action})")
             builder.do(f"call void @move(ptr {carry}, ptr {constants}, ptr {seen}, ptr {action}, ptr {action_key})")

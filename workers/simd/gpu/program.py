@@ -36,7 +36,7 @@ from es_service.protocol.policy_spec import Activation, PolicySpec
 from workers.environments import Environment
 from workers.episode import episode_steps
 from workers.simd.backend.emit import graph_function
-from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.backend.native import words_of
 from workers.simd.backend.ptx import EXACT, Pointer, QuickWriter, StepCall, lane_function
 from workers.simd.backend.target import Target
@@ -124,7 +124,7 @@ def layer_function(layer: GpuLayer, target: Target) -> FunctionBuilder:
     noises = builder.at("%noises", builder.value(f"add i64 {builder.value(f'mul i64 {first}, %pairs')}, {pair}"), "i64")
     centre, seen = builder.at("%centre", builder.index((first, TILE)), "float"), builder.at("%seen", member, "float")
 
-    def weights_of(row: str | int) -> Values:
+    def weights_of(row: str | int) -> Names:
         """Weights of both members, [output, sign]."""
         j_T = _noise(builder, builder.at(noises, builder.value(f"mul i64 {row}, %pairs"), "i64"))
         weights = []
@@ -137,7 +137,7 @@ def layer_function(layer: GpuLayer, target: Target) -> FunctionBuilder:
             weights += [plus, minus]
         return weights
 
-    def add(row: str, sums: Values) -> Values:
+    def add(row: str, sums: Names) -> Names:
         x_S = _vector(builder, builder.at(seen, builder.value(f"mul i64 {row}, {members}"), "float"), 2, 1)
         return [builder.fma(x_S[k % 2], w, s) for k, (w, s) in enumerate(zip(weights_of(row), sums, strict=True))]
 
@@ -157,7 +157,7 @@ def _row_and_pair(builder: FunctionBuilder) -> tuple[str, str]:
     return builder.value("udiv i64 %lane, %pairs"), builder.value("urem i64 %lane, %pairs")
 
 
-def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE // 4) -> Values:
+def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE // 4) -> Names:
     """Neighbouring floats in memory, each as a vector of one lane, by loads of `size`."""
     vectors, whole = [], f"<{size} x float>"
     for number in range(loads):
@@ -168,7 +168,7 @@ def _vector(builder: FunctionBuilder, pointer: str, size: int, loads: int = TILE
     return vectors
 
 
-def _noise(builder: FunctionBuilder, pointer: str) -> Values:
+def _noise(builder: FunctionBuilder, pointer: str) -> Names:
     """The noise j of a row of a tile as floats: the difference of 2^23 + byte, which needs no conversion, and of 2^23
     plus the bias of bytes. Both are exact."""
     floats, word = builder.llvm_types["f"], builder.value(f"load i64, ptr {pointer}, align 8")
