@@ -14,8 +14,8 @@ from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
-from es_service.protocol.evaluator import Session
-from es_service.protocol.system import given_path
+from es_service.protocol.episodes import Session
+from es_service.protocol.machine import given_path
 from es_service.report.progress import in_notebook, show_in_notebook
 from es_service.runs import view
 from es_service.runs.checked_config import changed_config, load_config

@@ -28,7 +28,8 @@ from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
 from es_service.loop.history import Row
 from es_service.protocol.child import require_same_process
-from es_service.protocol.evaluator import Session
+from es_service.protocol.episodes import Session
+from es_service.protocol.machine import given_path
 from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
@@ -38,7 +39,6 @@ from es_service.protocol.messages import (
     Work,
     WorkerSpec,
 )
-from es_service.protocol.system import given_path
 from es_service.runs.checked_config import load_config
 from es_service.runs.session import OnNotice, Outcome, checked_metrics, warn
 from es_service.runs.sessions import Listener

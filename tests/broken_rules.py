@@ -163,13 +163,13 @@ SENT = "es_service/protocol/sent.py"
 ADAM, SHAPING = "es_service/search/steps.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, ARRAYS = "es_service/search/maps/behaviour_map.py", "es_service/loop/arrays.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
-SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
+SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_state.py"
 ENGINE, DEADLINES = "es_service/dispatch/engine.py", "es_service/dispatch/assignment.py"
 EPISODE, WORKER = "workers/episode.py", "workers/worker.py"
 RESULTS, POLICY = "workers/rollouts/backend.py", "workers/policies/policy.py"
 XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
-LOW_RANK = "es_service/protocol/low_rank.py"
+LOW_RANK = "es_service/protocol/policy_spec.py"
 LOW_RANK_OF_KERNELS = "workers/simd/episodes/low_rank.py"
 LOW_RANK_OF_XLA = "workers/policies/pairs.py"
 NOISE_OF_KERNELS = "workers/simd/episodes/noise.py"
@@ -528,7 +528,7 @@ CASES = [
         ("count no steps", "es_service/loop/finished.py", " + correction.env_steps", ""),
         (
             "have the stored places",
-            "es_service/loop/correction.py",
+            "es_service/loop/evaluated.py",
             "doubles(results.descriptor).mean(axis=1)[valid_N]",
             "map_.descriptor_N_B[rows][valid_N]",
         ),

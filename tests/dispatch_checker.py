@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from es_service.dispatch.dispatch_log import FILE
+from es_service.dispatch.events import FILE
 from es_service.protocol.messages import WorkItemId
 
 

@@ -21,7 +21,7 @@ from es_service.loop.arrays import MAP, joined, value_of
 from es_service.loop.contents import stored_elite
 from es_service.loop.history import NO_INTEGER
 from es_service.protocol.content import Policy
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.episodes import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from workers.recording import recorder

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
-from es_service.protocol.newest_output import newest_output
-from es_service.protocol.process_environment import DEPTH, worker_environment
-from es_service.protocol.raised import sendable
+from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
 from es_service.protocol.sent import LackingError, Received
 from es_service.protocol.sources import OtherCodeError, why_refused
+from es_service.protocol.user_code import sendable
 from workers import progress
 from workers.xla_cache import xla_cache_settings
 

@@ -27,7 +27,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
 )
 from es_service.protocol.noise import KEY_WORDS
-from es_service.protocol.parameters import ParameterSpec
+from es_service.protocol.options import ParameterSpec
 from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable
 from workers.host.policies import gradient_summer, members

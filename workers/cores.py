@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 from es_service.protocol.child import end_with
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec, recipes_in
-from es_service.protocol.raised import sendable
+from es_service.protocol.user_code import sendable
 from workers import progress
 from workers.compilable import Compilable
 from workers.rollouts import BACKENDS

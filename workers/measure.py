@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from es_service.protocol.child import answer_parent
+from es_service.protocol.machine import peak_memory_mib
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol.rollouts import why_not
-from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters

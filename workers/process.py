@@ -19,9 +19,9 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from es_service.protocol.messages import WorkerSpec
-from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sent import LackingError, Received
 from es_service.protocol.sources import why_refused
+from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import framed, receive
 from workers import progress
 from workers.progress import Seen

@@ -1,7 +1,7 @@
 """What a worker tells besides results: what its process prints, and that it should be replaced by a new process.
 
 A simulator prints to the descriptors 1 and 2, also in C and from processes of its own. Those lead to files, of which
-the newest part is stored (`es_service/protocol/newest_output.py`); the worker reads there what is new.
+the newest part is stored (`es_service/protocol/process_environment.py`); the worker reads there what is new.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 
 from es_service.protocol.errors import TaskError
+from es_service.protocol.machine import memory_of_tree_bytes
 from es_service.protocol.messages import ChunkResult, EpisodesResult, Report, WorkerSpec
-from es_service.protocol.system import memory_of_tree_bytes
 
 PRINTED_BYTES = 2000
 """At most this many bytes of what is new are told at a time: the newest."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue
-from es_service.protocol.raised import raised
+from es_service.protocol.user_code import raised
 from workers.environments import Environment, TaskError, make_environment
 from workers.simd.frontend.trace import jaxpr_digest
 from workers.simd.graph.graph import UnsupportedError

@@ -10,8 +10,7 @@ import hashlib
 import os
 import stat
 
-from es_service.protocol.machine import cpu_kind
-from es_service.protocol.system import processor_fields
+from es_service.protocol.machine import cpu_kind, processor_fields
 from workers.simd.backend.cache import cache_folder
 
 MOST_BYTES = 200 * 2**20

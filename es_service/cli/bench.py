@@ -15,11 +15,11 @@ from es_service.config.parts import TASK_OPTIONS
 from es_service.config.resolution import options_of
 from es_service.config.tasks import CALLER, OTHER_TASKS, ROLLOUTS, TASKS, read_options
 from es_service.config.text import did_you_mean_task, one_of, problem_of
-from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.child import Child, NoAnswerError
+from es_service.protocol.machine import cores
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.raised import RaisedError
+from es_service.protocol.user_code import RaisedError
 
 BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)

@@ -28,7 +28,7 @@ from es_service.config.text import in_line, show
 from es_service.config.workload import config_warnings
 from es_service.errors import ConfigError, ServiceError, WayOut
 from es_service.logs import FORMAT
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.runs.run_status import runs_of
 from es_service.store.folder import holds_run
 

@@ -24,17 +24,15 @@ from es_service.config.tasks import TASKS
 from es_service.config.text import did_you_mean_task, one_of
 from es_service.config.workload import worker_spec
 from es_service.dispatch.cluster_findings import Finding
-from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, ServiceError, counted
-from es_service.protocol.machine import platform_info
+from es_service.loop.state import no_observations, normalisation
+from es_service.protocol.machine import cores, memory_bytes, platform_info
 from es_service.protocol.messages import UNBOUNDED, Centre, EpisodesResult, TaskSpec, TrainingChunk
 from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
-from es_service.protocol.system import memory_bytes
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.verification import compared, examined
-from es_service.search.observation_statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import NoVectorsError, host_target

@@ -33,7 +33,7 @@ from es_service.cli.common import (
     readable,
 )
 from es_service.errors import ConfigError, StoreError
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.report.progress import print_notice
 from es_service.runs.evaluation import Fresh
 from es_service.runs.view import Run

@@ -22,7 +22,7 @@ from es_service.cli.common import (
     readable,
 )
 from es_service.errors import ConfigError, WayOut
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 
 if TYPE_CHECKING:
     from es_service.report.data import RunData

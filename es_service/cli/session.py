@@ -38,7 +38,7 @@ from es_service.cli.common import (
 from es_service.cli.status import print_certified, print_summary
 from es_service.errors import Interrupted, RunLockedError, ServiceError, WayOut
 from es_service.loop.history import Row
-from es_service.protocol.raised import users_error
+from es_service.protocol.user_code import users_error
 from es_service.report.progress import ShowNotice, ShowRow, print_notice, show_progress
 from es_service.runs.checked_config import changed_config
 from es_service.runs.tracking import tracked

@@ -39,9 +39,9 @@ from es_service.config.tasks import TASKS
 from es_service.config.text import did_you_mean, nearest, show
 from es_service.config.values import DescribedKey, described_keys, methods_words
 from es_service.errors import ConfigError, ServiceError
+from es_service.protocol.machine import given_path
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
-from es_service.protocol.system import given_path
 from es_service.report.progress import short
 from es_service.runs.run_status import (
     Recent,

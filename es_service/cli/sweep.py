@@ -41,7 +41,7 @@ from es_service.cli.common import (
 from es_service.config.given import parse_overrides
 from es_service.config.text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem, counted
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import Certifying, OnProgress, SweptRun, run_planned
 from es_service.runs.sweep_plan import Labelled, left_out_notes, plan

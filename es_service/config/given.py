@@ -11,7 +11,7 @@ from typing import Any
 from es_service.config.keys import GROUPS, not_a_mapping
 from es_service.config.text import did_you_mean, in_line, nearest, parse_value, plain, problem_of, read_yaml_file
 from es_service.errors import ConfigError, Problem
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 
 PACKAGE = Path(__file__).parents[1]
 PLACES = (PACKAGE.parent / "configs", PACKAGE / "shipped_configs")

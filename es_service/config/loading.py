@@ -38,9 +38,9 @@ from es_service.config.tasks import CHOICES, OTHER_TASKS, Tasks, read_options, s
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
 from es_service.config.values import allowed_words, validator_problems, value_problems
 from es_service.errors import ConfigError, Problem, counted
+from es_service.protocol.machine import given_path
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.rollouts import Rollouts
-from es_service.protocol.system import given_path
 
 NORMALISED, CLIP = "policy.observation_normalization", "policy.observation_clip"
 _CHOSEN = {"search.algorithm", "search.preset", "search.init_from"}

@@ -24,8 +24,10 @@ from es_service.errors import ConfigError, Problem
 from es_service.protocol.child import END_S, Child, NoAnswerError
 from es_service.protocol.messages import NO_CHOICES, UNBOUNDED, HostChoices, TaskSpec, with_options
 from es_service.protocol.options import (
+    FREE,
     Option,
     OptionValue,
+    ParameterSpec,
     allowed_text,
     allowed_value,
     choice,
@@ -34,11 +36,10 @@ from es_service.protocol.options import (
     option_values,
 )
 from es_service.protocol.outputs import CHOSEN_METRIC
-from es_service.protocol.parameters import FREE, ParameterSpec
 from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
-from es_service.protocol.raised import RaisedError
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import task_code, user_sources
+from es_service.protocol.user_code import RaisedError
 from workers import environments
 from workers.rollouts import BACKENDS
 

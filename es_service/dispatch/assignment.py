@@ -32,14 +32,16 @@ import math
 from itertools import takewhile
 
 from es_service.dispatch.events import Assign, Command, Compiled, Progress, key_of
-from es_service.dispatch.scheduler_changes import copy_item, put_worker, take_item
 from es_service.dispatch.scheduler_state import (
     LATE,
     SchedulerState,
     Slot,
     Waiting,
     Worker,
+    copy_item,
     has_idle_worker_for_copies,
+    put_worker,
+    take_item,
     usual_chunk_s,
 )
 from es_service.protocol.messages import GradientChunk

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import events
-from es_service.dispatch.computing import Computing
-from es_service.dispatch.dispatch_log import Log, no_log
+from es_service.dispatch.events import Log, no_log
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import (
     initial_state,
@@ -29,15 +28,14 @@ from es_service.dispatch.scheduler_state import (
     usual_chunk_s,
     workers_with_place,
 )
-from es_service.dispatch.waits import Waits
+from es_service.dispatch.waits import Computing, Waits
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.child import require_same_process
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.episodes import DispatchCounts, pieces_of, together
+from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
-from es_service.protocol.pieces import pieces_of, together
 from es_service.protocol.policies import POLICY_SLOTS
-from es_service.protocol.system import cpu_seconds
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)

@@ -17,27 +17,28 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
-from es_service.dispatch.cores import places
-from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import (
     Compiled,
     Drain,
     Failure,
     Limits,
+    Log,
     Placed,
     Progress,
     WorkerLost,
     WorkerUp,
+    no_log,
     with_last_words,
 )
 from es_service.dispatch.staying import staying
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.content import Cache
+from es_service.protocol.machine import places
 from es_service.protocol.messages import FloatArray, Report, Work, WorkerSpec
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sent import LACKS_AGAIN, SENDER_BYTES, Memory, parcel
+from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import Channel, framed
 
 PIECE_S = 0.1

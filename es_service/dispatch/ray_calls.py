@@ -17,8 +17,8 @@ from es_service.dispatch.ray_nodes import Membership
 from es_service.errors import EvaluationError
 from es_service.protocol.content import Cache
 from es_service.protocol.messages import Report, Work
-from es_service.protocol.raised import RaisedError
 from es_service.protocol.sent import SENDER_BYTES, Memory, parcel
+from es_service.protocol.user_code import RaisedError
 
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of an array that is sent with a call; a larger one is stored, and fetched once per node."""

@@ -19,10 +19,19 @@ from types import ModuleType
 from typing import Any
 
 from es_service.config.workload import ANY_NUMBER
-from es_service.dispatch.cores import cores
-from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.events import (
+    Compiled,
+    Drain,
+    Failure,
+    Limits,
+    Log,
+    Placed,
+    SetWorkers,
+    WorkerLost,
+    WorkerUp,
+    no_log,
+)
 from es_service.dispatch.ray_calls import (
     LOOK_S,
     LOOKS,
@@ -36,10 +45,11 @@ from es_service.dispatch.ray_calls import (
 )
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
+from es_service.protocol.machine import cores
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
-from es_service.protocol.raised import raised
 from es_service.protocol.sent import LACKS_AGAIN, Memory
 from es_service.protocol.sources import OtherCodeError
+from es_service.protocol.user_code import raised
 
 MOST_GONE = 64
 """Lost workers of which the places are known."""

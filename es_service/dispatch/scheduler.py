@@ -21,7 +21,7 @@ Rules:
   attempt only if they were started after the first of them was lost.
 
 assignment.py decides which worker gets which item, how long it may take, and which items are sent a second time.
-scheduler_changes.py keeps the containers of the state consistent.
+scheduler_state.py keeps the containers of the state consistent.
 
 Cost: an event looks only at the workers and items that it concerns and at those that it stops or assigns
 (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the run, and events before a first worker is up
@@ -66,20 +66,24 @@ from es_service.dispatch.events import (
     because,
     key_of,
 )
-from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
 from es_service.dispatch.scheduler_state import (
     IN_TIME,
     LATE,
     SchedulerState,
     Worker,
+    append_items,
     by_progress,
     down_limit,
+    drop_item,
     find_slot,
     holds,
     is_down,
     late_workers,
     loss_text,
     next_deadline,
+    pop_worker,
+    put_worker,
+    return_item,
     without,
 )
 

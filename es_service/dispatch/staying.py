@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from functools import cache
 from threading import Lock
 
-from es_service.dispatch.cores import cores
 from es_service.protocol.child import Child
+from es_service.protocol.machine import cores
 
 IDLE_PER_CORE = 2
 """Most processes that wait, for each core: those of two kinds of runs that take turns."""

@@ -21,6 +21,7 @@ from es_service.config.sections import BudgetConfig
 from es_service.config.workload import policy_spec
 from es_service.loop import budget as budgets
 from es_service.loop.arrays import state_of
+from es_service.loop.budget import Clock
 from es_service.loop.checks import (
     invalidate,
     require_asks,
@@ -30,10 +31,8 @@ from es_service.loop.checks import (
     require_state,
     require_weights,
 )
-from es_service.loop.clock import Clock
-from es_service.loop.contents import Contents, Named
-from es_service.loop.correction import correct
-from es_service.loop.evaluated import policies_asked, told_of_asks, told_of_initial
+from es_service.loop.contents import Contents, Named, as_population
+from es_service.loop.evaluated import correct, policies_asked, told_of_asks, told_of_initial
 from es_service.loop.finished import Finished, Members, finish, reachable_in, rows
 from es_service.loop.generation import (
     estimate_gradients,
@@ -46,9 +45,8 @@ from es_service.loop.generation import (
 )
 from es_service.loop.history import HistoryRow
 from es_service.loop.interfaces import Search, Stop, Store, Stored
-from es_service.loop.policies import as_population
 from es_service.loop.state import RunState
-from es_service.protocol.evaluator import DispatchCounts, Evaluator, Requests, Session, Value
+from es_service.protocol.episodes import DispatchCounts, Evaluator, Requests, Session, Value
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.novelty import novelty

@@ -1,9 +1,10 @@
-"""What a generation has evaluated, in the order of its asks: what the search is told, and the rows of the table."""
+"""What a generation has evaluated, what the search is told, and what the elites are worth in new episodes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,15 @@ from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
 from es_service.loop.checks import valid_members
-from es_service.loop.contents import Named
-from es_service.loop.generation import first_episode, highest, results_in, steps_of
-from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, with_gaps
-from es_service.loop.policies import PolicyWork, no_statistics, policy_work
-from es_service.protocol.episodes import joined
+from es_service.loop.contents import Named, PolicyWork, no_statistics, policy_work
+from es_service.loop.generation import episodes_of, first_episode, highest, results_in, steps_of
+from es_service.loop.history import CORRECTED, NO_POLICY, RESETS, HistoryRow, Table, doubles, episodes_table, with_gaps
+from es_service.loop.interfaces import Search
+from es_service.protocol.episodes import Requests, joined
 from es_service.protocol.messages import Centre, EpisodesResult, PolicySpec, TaskSpec
-from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk
-from es_service.search.maps.behaviour_map import EMPTY
+from es_service.protocol.noise import Domain
+from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
+from es_service.search.maps.behaviour_map import EMPTY, empty_map, insert_each, map_statistics
 from es_service.search.steps import norm
 
 _Evaluated = tuple[Centre | PolicyWork, EpisodesResult, Mapping[str, Any]]
@@ -179,3 +181,74 @@ def evaluated_table(
         "fitness_first": episodes.fitness[:, 0],
         **{name: with_gaps(values) if name in RESETS else values for name, values in told.columns.items()},
     }
+
+
+# What the elites of the map are worth in new episodes: the corrected columns of the history.
+#
+# Every `map.correct_every` generations, all elites are evaluated in `map.correct_episodes` episodes each, and put into
+# an empty map by their mean fitness and their mean descriptor. Elites that were misplaced by luck then collide, so
+# coverage falls. Source: the corrected archive of Flageat and Cully 2023 (arXiv:2302.00463). The search learns nothing
+# from these episodes, whose resets have a domain of their own. They count as environment steps.
+#
+# Axes: N elites, E episodes.
+
+ELITES_AT_ONCE = 256
+"""Elites that are evaluated side by side, so that the policies of large maps need not be in memory together. It is part
+of the addresses of the resets, and so a constant."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Columns of the history, and what they have cost."""
+
+    columns: HistoryRow = field(default_factory=dict)
+    env_steps: int = 0
+    episodes: int = 0
+
+
+def correct(
+    search: Search, policies: Callable[[PolicyAsk], PolicyAsk], learned: SearchState, generation: int
+) -> Requests[Correction]:
+    """The corrected columns of a generation; without values where it does not correct, and none if no generation does.
+
+    Args:
+        policies: returns policies that are asked for by name, with their parameters and statistics.
+        learned: the search's state after it was told the evaluations of the generation.
+    """
+    settings, map_ = search.config.map, learned.map
+    if settings.correct_every is None or map_ is None:
+        return Correction()
+    if generation % settings.correct_every or not map_.size:
+        return Correction(dict.fromkeys(CORRECTED))
+    again, steps, episodes = empty_map(map_.geometry), 0, 0
+    for ask, first in enumerate(range(0, map_.size, ELITES_AT_ONCE)):
+        rows = slice(first, first + ELITES_AT_ONCE)
+        results = yield from _episodes(search, policies(PolicyAsk(map_.policy_N[rows])), generation, ask)
+        with np.errstate(invalid="ignore", over="ignore"):  # an elite with an infinite fitness leaves
+            valid_N = np.asarray(valid_members(results).all(axis=1))
+            columns = (map_.centre_N[rows][valid_N], np.full(int(valid_N.sum()), np.nan))
+            descriptor_N_B = doubles(results.descriptor).mean(axis=1)[valid_N]
+            if valid_N.any():
+                fitness_N = doubles(results.fitness).mean(axis=1)[valid_N]
+                again = insert_each(again, descriptor_N_B, fitness_N, generation, *columns)
+        steps, episodes = steps + steps_of(results), episodes + results.fitness.size
+    statistics = map_statistics(again, settings.qd_offset, None)
+    values = statistics["coverage"], statistics["qd_score"], statistics["map_fitness_max"]
+    return Correction(dict(zip(CORRECTED, values, strict=True)), steps, episodes)
+
+
+def _episodes(search: Search, elites: PolicyAsk, generation: int, ask: int) -> Requests[EpisodesResult]:
+    """Results of some elites' episodes, [N, E]."""
+    mean_N_O, std_N_O = elites.observation_mean_N_O, elites.observation_std_N_O
+    assert mean_N_O is not None, "a stored policy has its statistics"
+    assert std_N_O is not None
+    work = policy_work(
+        elites.parameters_N_D,
+        (mean_N_O, std_N_O),
+        search.config.map.correct_episodes,
+        seed=search.config.seed,
+        generation=generation,
+        ask=ask,
+        domain=Domain.CORRECTION_RESET,
+    )
+    return (yield from episodes_of([(work.work, work.shape)]))[0][0]

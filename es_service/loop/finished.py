@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.loop.arrays import Changes, changes, names_of
-from es_service.loop.budget import MOST_DURATIONS, durations
+from es_service.loop.budget import MOST_DURATIONS, Clock, durations
 from es_service.loop.checks import require_known, require_storable
-from es_service.loop.clock import Clock
 from es_service.loop.contents import Named
-from es_service.loop.correction import Correction
-from es_service.loop.evaluated import evaluated_table
+from es_service.loop.evaluated import Correction, evaluated_table
 from es_service.loop.generation import better, fittest, results_in
 from es_service.loop.history import (
     METRIC,
@@ -26,13 +24,12 @@ from es_service.loop.history import (
     population_columns,
 )
 from es_service.loop.interfaces import Search
-from es_service.loop.state import RunState
+from es_service.loop.state import RunState, merge_moments
 from es_service.protocol.content import Contents
 from es_service.protocol.messages import EpisodesResult, Moments
 from es_service.search.algorithms.base import CentreEvaluations, SearchState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.maps.geometry import reachable_cells
-from es_service.search.observation_statistics import merge_moments
 from es_service.search.steps import norm
 
 Reachable = NDArray[np.bool_] | None

@@ -1,8 +1,9 @@
-"""Everything that a run carries from one generation to the next."""
+"""Everything that a run carries from one generation to the next, with the statistics of observations."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,53 @@ from numpy.typing import NDArray
 from es_service.protocol.content import NAME
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.search.algorithms.base import CentreState, SearchState
-from es_service.search.observation_statistics import normalisation
+
+# Running statistics of observations, merged by the driver in chunk order and in float64. Axis O: observation.
+
+STD_FLOOR = 0.1
+"""Least standard deviation for normalisation. Source: released code of the ES papers, sqrt(max(var, 0.01))."""
+
+
+def no_observations(size: int) -> Moments:
+    """Statistics of no observations of this size, as before the first generation."""
+    return Moments(0.0, np.zeros(size), np.zeros(size))
+
+
+def moments_of(values_N_O: NDArray[Any]) -> Moments:
+    """Moments of N values along the first axis, computed in float64; they may have other axes, or none."""
+    mean_O = values_N_O.mean(axis=0, dtype=np.float64)
+    return Moments(float(len(values_N_O)), mean_O, np.square(values_N_O - mean_O).sum(axis=0, dtype=np.float64))
+
+
+def merge_moments(total: Moments, parts: Iterable[Moments]) -> Moments:
+    """Merge `parts` into `total` one after another, in the order given, which affects the last bits of the result.
+
+    Source: pairwise update of Chan, Golub and LeVeque 1983.
+    """
+    for part in parts:
+        if part.count == 0.0:
+            continue
+        count = total.count + part.count
+        delta_O = part.mean_O - total.mean_O
+        total = Moments(
+            count,
+            total.mean_O + delta_O * (part.count / count),
+            total.m2_O + part.m2_O + np.square(delta_O) * (total.count * part.count / count),
+        )
+    return total
+
+
+def normalisation(moments: Moments, enabled: bool) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (population formula) that normalise observations, float32 [O] each.
+
+    They are 0 and 1 if normalisation is off or if nothing has been counted. The standard deviation is at least
+    STD_FLOOR.
+    """
+    if not enabled or moments.count == 0.0:
+        size = moments.mean_O.shape[0]
+        return np.zeros(size, np.float32), np.ones(size, np.float32)
+    std_O = np.sqrt(np.maximum(moments.m2_O / moments.count, STD_FLOOR**2))
+    return moments.mean_O.astype(np.float32), std_O.astype(np.float32)
 
 
 @dataclass(frozen=True)

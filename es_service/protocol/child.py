@@ -29,9 +29,8 @@ from queue import SimpleQueue
 from typing import IO, Any, NamedTuple, Self
 
 from es_service.protocol.errors import ForkedError
-from es_service.protocol.newest_output import newest_output
-from es_service.protocol.process_environment import child_environment
-from es_service.protocol.raised import RaisedError, raised
+from es_service.protocol.process_environment import child_environment, newest_output
+from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import BUFFER_BYTES, framed, receive
 
 PR_SET_PDEATHSIG = 1

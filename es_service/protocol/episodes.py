@@ -1,26 +1,31 @@
-"""Results of episodes: their addresses, and all rows of a request in one, however they were cut and put together."""
+"""Requests for episodes and their results, by address, however they were cut and put together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
+    ChunkResult,
     EpisodesResult,
     EvaluationChunk,
     Policies,
     PolicyChunk,
+    Subject,
     TrainingChunk,
     Work,
+    recipes_in,
 )
 from es_service.protocol.policies import POLICY_SLOTS, slots
+from es_service.protocol.recipes import Recipes
 
 ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
 """Arrays that every result has."""
@@ -127,3 +132,150 @@ def part_of(results: EpisodesResult, index: int) -> EpisodesResult:
         return part
     first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[index]))
     return replace(part, of_steps={name: array[first : first + rows] for name, array in results.of_steps.items()})
+
+
+# Requests: generators that yield work and receive its results, and the interface of what computes it.
+
+Value = TypeVar("Value")
+Evaluate = Callable[[Sequence[Work]], list[ChunkResult]]
+"""Function from chunks to their results, in the order of the chunks."""
+Requests = Generator[Sequence[Work], list[ChunkResult], Value]
+"""Yields chunks, each time receives their results in the order of the chunks, and returns what it makes of them.
+
+Whoever drives it decides where the chunks are computed: an engine, the caller of `ask_tell`, or a test with a list.
+"""
+
+Session = Generator[Sequence[Work] | None, list[ChunkResult] | None, Value]
+"""As `Requests`, but in two steps, so that the driver need not wait: it yields chunks to be sent, stores the generation
+before once it is resumed, yields None, and receives the results."""
+
+
+@dataclass(frozen=True)
+class DispatchCounts:
+    """Numbers of workers and of faults of an evaluator since it was made."""
+
+    retries: int = 0
+    """Chunks that were sent again after a fault, including those that a lost worker had not begun. Second copies of
+    chunks that a worker was late with do not count."""
+    lost_workers: int = 0
+    """Workers that were lost, or stopped because of a fault."""
+    workers: int = 0
+    """Workers that the evaluator is to keep running."""
+    rollout_s: float = math.nan
+    """Seconds in which workers have computed; NaN if they are not measured."""
+    cpu_s: float = math.nan
+    """Seconds of the processors of this process and of all its workers; NaN if they are not measured."""
+
+
+class Evaluator(Protocol):
+    """Interface of what computes chunks. Results do not depend on where, in what order or how often."""
+
+    @property
+    def counts(self) -> DispatchCounts:
+        """Numbers of workers and of faults so far."""
+        ...
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        """Have chunks run, and return the function that waits for their results, which `evaluate` returns."""
+        ...
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        """Results of chunks in the order of `work`.
+
+        Raises:
+            EvaluationError: the chunks cannot be computed.
+            Interrupted: a stop was requested.
+        """
+        ...
+
+
+def completed(requests: Requests[Value], evaluate: Evaluate) -> Value:
+    """What a generator of work returns, all of whose work is computed by one function."""
+    results: Any = None
+    while True:
+        try:
+            work = requests.send(results)
+        except StopIteration as end:
+            return end.value
+        results = evaluate(work)
+
+
+# Evaluation and policy chunks in pieces, for tasks whose episodes may take long: each piece can go to another worker.
+# And policy chunks that are several in one, for tasks whose episodes take less than a message.
+#
+# Results know the addresses of their rows (`protocol.episodes`), so nobody needs to know how chunks were cut. They stay
+# those of the whole chunks, as far as the bits of an episode do not depend on the others that are computed with it.
+
+
+def pieces_of(work: Work, most: int) -> list[Work]:
+    """A chunk in pieces with at most `most` episodes each; chunks of training and of gradients are one piece."""
+    subject, chunk = work
+    if isinstance(chunk, EvaluationChunk):
+        starts = range(0, chunk.episodes, most)
+        return [
+            (subject, replace(chunk, first=chunk.first + start, episodes=min(most, chunk.episodes - start)))
+            for start in starts
+        ]
+    if isinstance(chunk, PolicyChunk) and isinstance(subject, Policies):
+        count = len(slots(subject, chunk)[0])
+        starts = range(0, count, most)
+        return [
+            (subject, replace(chunk, first=chunk.first + start, count=min(most, count - start))) for start in starts
+        ]
+    return [work]
+
+
+def together(work: Sequence[Work], most: int) -> list[Work]:
+    """A work item as it is sent: neighbouring policies of one ask that are made of recipes and have one episode each
+    are one chunk, as far as they are at most `most`, and all recipes have the parents that they need.
+
+    The slots of policies with more episodes, or with observation statistics, stay as they are.
+    """
+    groups: list[list[Work]] = []
+    for subject_chunk in work:
+        if groups and _goes_on(groups[-1], subject_chunk, most):
+            groups[-1].append(subject_chunk)
+        else:
+            groups.append([subject_chunk])
+    sent: dict[int, Subject] = {}  # by `id`, since chunks with the same policies share them
+    merged = []
+    for group in groups:
+        (subject, chunk), recipes = group[0], [recipes_in(its_subject) for its_subject, _ in group]
+        if id(subject) not in sent:
+            sent[id(subject)] = subject
+            if isinstance(subject, Policies) and recipes[0] is not None:
+                sent[id(subject)] = replace(subject, parameters_N_D=_joined(recipes).part(slice(None)))
+        if isinstance(chunk, PolicyChunk) and len(group) > 1:
+            chunk = replace(chunk, count=sum(len(part) for part in recipes if part is not None))
+        merged.append((sent[id(subject)], chunk))
+    return merged
+
+
+def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
+    """Recipes of one ask, one after another."""
+    parts = [part for part in recipes if part is not None]
+    if len(parts) == 1:
+        return parts[0]
+    of_all = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("parent_N_2", "key_N_4")}
+    return replace(parts[0], **of_all)
+
+
+def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
+    """Whether the policies of a chunk are the next ones after those of a group."""
+    (subject, chunk), (before, last), (beginning, _) = work, group[-1], group[0]
+    recipes, earlier = recipes_in(subject), recipes_in(before)
+    return (
+        recipes is not None
+        and earlier is not None
+        and recipes.names is earlier.names  # those of one ask
+        and isinstance(subject, Policies)
+        and isinstance(before, Policies)
+        and isinstance(beginning, Policies)
+        and subject.first + len(recipes) - beginning.first <= most
+        and subject.episodes == 1
+        and subject.observation_mean_N_O is before.observation_mean_N_O is None
+        and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
+        and chunk == replace(last, chunk_id=last.chunk_id + 1)
+        and isinstance(chunk, PolicyChunk)
+        and (chunk.part, chunk.first, chunk.count) == (0, 0, POLICY_SLOTS)
+    )

@@ -17,8 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.options import Option, OptionValue
-from es_service.protocol.parameters import ParameterSpec
+from es_service.protocol.options import Option, OptionValue, ParameterSpec
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recipes import Recipes
@@ -153,7 +152,7 @@ class WorkerSpec:
     rollout: str
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     noise_rank: int = 0
-    """Rank of the noise of each weight matrix, as in `low_rank.py`; 0: each parameter has a number of its own."""
+    """Rank of the noise of each weight matrix, as in `policy_spec.py`; 0: each parameter has a number of its own."""
     choices: HostChoices = NO_CHOICES
     """What the config chooses for a task of Python objects."""
     allow_infeasible: bool = False
@@ -174,7 +173,7 @@ class WorkerSpec:
     memory_bytes: int | None = None
     """Memory, for each core, above which a worker should be replaced by a new process; None: any amount."""
     output_bytes: int = 2**20
-    """Most bytes that are kept of what its process prints; see `newest_output.py`."""
+    """Most bytes that are kept of what its process prints; see `process_environment.py`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
     platform: str = "any"

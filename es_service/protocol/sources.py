@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-from es_service.protocol.system import architecture
+from es_service.protocol.machine import architecture
 
 Sources = Mapping[str, str]
 """Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from es_service.errors import counted
-from es_service.protocol.parameters import FREE
+from es_service.protocol.options import FREE
 from es_service.report import curves, facts, floor, maps, series
 from es_service.report.data import RunData
 from es_service.report.facts import changed_settings, number

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import ConfigError, NotInRunError
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.report import between, compare, maps, statistics
 from es_service.report.data import RunData, read_run
 from es_service.report.floor import beside_walls, detours, is_plan

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from es_service.errors import ConfigError, ServiceError, StoreError, WayOut
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.report import between, compare, curves, maps, series
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run

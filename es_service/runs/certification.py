@@ -27,7 +27,7 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.protocol.content import Policy
-from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.episodes import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.runs.certified import (

@@ -22,9 +22,8 @@ from typing import Any
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
-from es_service.dispatch.dispatch_log import Entry, Log, no_log
 from es_service.dispatch.engine import Engine
-from es_service.dispatch.events import Compiled, Limits
+from es_service.dispatch.events import Compiled, Entry, Limits, Log, no_log
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.logs import logger
 from es_service.protocol.machine import platform_info, platform_text

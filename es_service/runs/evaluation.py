@@ -19,15 +19,15 @@ from es_service.config.tasks import task_of
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.arrays import BEST, CENTRES, OBSERVATIONS
 from es_service.loop.generation import evaluate_centres
+from es_service.loop.state import merge_moments, moments_of
 from es_service.protocol.content import Policy
-from es_service.protocol.evaluator import Evaluator, completed
+from es_service.protocol.episodes import Evaluator, completed
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray, Moments
 from es_service.runs.checked_config import changed_config
 from es_service.runs.engine import engine_here
 from es_service.runs.snapshot import Snapshot, acting
 from es_service.runs.view import Run, named_best
 from es_service.runs.worker_count import on_this_machine, require_cores
-from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
 """Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""

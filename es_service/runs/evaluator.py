@@ -25,7 +25,7 @@ from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, EvaluationError
 from es_service.logs import logger
 from es_service.loop.checks import valid_members
-from es_service.loop.policies import no_statistics, policy_work
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import require_same_process
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec

@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.config.text import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
-from es_service.protocol.parameters import ParameterSpec
+from es_service.protocol.options import ParameterSpec
 from es_service.runs.certified import newest_certified
 from es_service.runs.onnx import about, model_card, onnx_model
 from es_service.runs.snapshot import Policy, Snapshot, map_places

@@ -21,7 +21,7 @@ from es_service.config.text import show
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, NotInRunError, Problem
 from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, names_of, state_of, stored, value_of
-from es_service.loop.state import RunState
+from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Policy
 from es_service.protocol.messages import Moments
 from es_service.runs.certification import certify_run
@@ -35,7 +35,6 @@ from es_service.search.algorithms.common import elite_novelty
 from es_service.search.algorithms.measured import without_scores
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.novelty import sound_archive
-from es_service.search.observation_statistics import no_observations
 from es_service.search.steps import fresh_state
 from es_service.store import reader
 from es_service.store.beginning import SEVERAL, Beginning

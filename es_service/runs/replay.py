@@ -22,8 +22,8 @@ from es_service.loop.history import Resets
 from es_service.protocol.child import NoAnswerError, answer_of
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import FloatArray
-from es_service.protocol.raised import RaisedError
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
+from es_service.protocol.user_code import RaisedError
 from es_service.runs.certified import newest_certified
 from es_service.runs.checked_config import changed_config
 from es_service.runs.evaluation import Candidate, candidates, centre_of

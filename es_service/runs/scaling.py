@@ -29,6 +29,7 @@ from es_service.loop import driver
 from es_service.loop.budget import REACHED
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state
+from es_service.loop.state import no_observations
 from es_service.protocol.episodes import addressed, each
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
@@ -49,7 +50,6 @@ from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
 from es_service.search.novelty import extended
-from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore

@@ -13,11 +13,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.loop.contents import policy_work
 from es_service.loop.generation import episodes_of
-from es_service.loop.policies import policy_work
 from es_service.protocol.content import Policy
-from es_service.protocol.episodes import part_of
-from es_service.protocol.evaluator import Evaluator, completed
+from es_service.protocol.episodes import Evaluator, completed, part_of
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain
 

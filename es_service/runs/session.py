@@ -14,7 +14,7 @@ from es_service.config.rules import placing_seconds
 from es_service.config.sections import MapConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import parallel_sentence, policy_spec
-from es_service.dispatch.dispatch_log import Committed, dispatch_log
+from es_service.dispatch.events import Committed, dispatch_log
 from es_service.errors import (
     Action,
     ConfigError,
@@ -29,7 +29,8 @@ from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.history import METRIC, evaluated_word
 from es_service.loop.interfaces import Stop
-from es_service.protocol.evaluator import DispatchCounts, Session
+from es_service.loop.state import no_observations
+from es_service.protocol.episodes import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
@@ -40,7 +41,6 @@ from es_service.runs.snapshot import require_sound_state
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import patient_store
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.lock import RunLock

@@ -17,12 +17,12 @@ from es_service.config.changes import again_with
 from es_service.config.model import RunConfig
 from es_service.config.tasks import require_same_task, task_of
 from es_service.config.workload import require_episodes
-from es_service.dispatch import dispatch_log
+from es_service.dispatch import events
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
 from es_service.loop.interfaces import Stop
 from es_service.protocol.content import Policy
-from es_service.protocol.evaluator import Session
+from es_service.protocol.episodes import Session
 from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.certification import NamedPolicy, add_certified, different, opened, platform_of, workers_for
@@ -250,7 +250,7 @@ def create_run(
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations
             store.close()
-            (folder / dispatch_log.FILE).unlink(missing_ok=True)
+            (folder / events.FILE).unlink(missing_ok=True)
             remove_run_folder(folder, whole=is_new)
             error.run = None
             error.ways_out = tuple(

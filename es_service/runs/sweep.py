@@ -26,9 +26,9 @@ from es_service.logs import logger
 from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
 from es_service.protocol.child import END_S, Child, NoAnswerError, require_same_process
+from es_service.protocol.machine import given_path
 from es_service.protocol.process_environment import same_imports
-from es_service.protocol.raised import RaisedError
-from es_service.protocol.system import given_path
+from es_service.protocol.user_code import RaisedError
 from es_service.runs.certified import certified_over_time, target_reached
 from es_service.runs.run_status import INSIDE, recent_durations, write_groups
 from es_service.runs.session import OnNotice

@@ -16,16 +16,16 @@ from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop import driver
-from es_service.loop.clock import Clock
+from es_service.loop.budget import Clock
 from es_service.loop.contents import Contents
 from es_service.loop.finished import Finished, reachable_in, rows
 from es_service.loop.generation import initial_state
 from es_service.loop.history import HistoryRow, Table
 from es_service.protocol.child import NoAnswerError, answer_of
 from es_service.protocol.content import Arrays
-from es_service.protocol.evaluator import Evaluator, completed
+from es_service.protocol.episodes import Evaluator, completed
 from es_service.protocol.machine import CODE, platform_info
-from es_service.protocol.raised import RaisedError
+from es_service.protocol.user_code import RaisedError
 from es_service.runs.certification import platform_of, workers_for
 from es_service.runs.certified import Certified, Elsewhere, all_certifications, arrays_of
 from es_service.runs.engine import engine_here

@@ -15,9 +15,9 @@ from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.config.text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, Nodes, names_of
+from es_service.protocol.machine import given_path
 from es_service.protocol.messages import PolicySpec
-from es_service.protocol.parameters import ParameterSpec
-from es_service.protocol.system import given_path
+from es_service.protocol.options import ParameterSpec
 from es_service.runs.certified import (
     all_certifications,
     certified_by_task,

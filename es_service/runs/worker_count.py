@@ -12,10 +12,10 @@ from es_service.config.model import ENGINE_IMPLIES, RunConfig, implied_by
 from es_service.config.parts import RESOURCES
 from es_service.config.tasks import CALLER
 from es_service.config.workload import chunks_at_once
-from es_service.dispatch.cores import cores, places
 from es_service.dispatch.ray_cluster import nodes_of_cluster
 from es_service.dispatch.ray_nodes import actor_cores, with_work
 from es_service.errors import ConfigError, WayOut, counted
+from es_service.protocol.machine import cores, places
 
 GPU = f"{RESOURCES}gpu"
 

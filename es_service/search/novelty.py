@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.protocol.system import usable_cpus
+from es_service.protocol.machine import usable_cpus
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

@@ -9,7 +9,7 @@ import sqlite3
 from pathlib import Path
 
 from es_service.errors import DatabaseHeldError, StoreError, WayOut
-from es_service.protocol.system import mounts, mounts_of_linux
+from es_service.protocol.machine import mounts, mounts_of_linux
 
 CONFIG = "config.yaml"
 DATABASE = "run.db"

@@ -26,14 +26,12 @@ from es_service.config.workload import policy_spec
 from es_service.loop import driver
 from es_service.loop.arrays import state_of, stored
 from es_service.loop.history import history_columns
-from es_service.loop.state import RunState
+from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Arrays, Policy, name_of, names
-from es_service.protocol.episodes import addressed
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.episodes import DispatchCounts, addressed
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.maps.behaviour_map import columns_of
-from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta

@@ -30,9 +30,8 @@ import pandas as pd
 
 from es_service import api
 from es_service.cli.sweep import seeds_of
-from es_service.dispatch.cores import cores
 from es_service.errors import Interrupted
-from es_service.protocol.machine import cpu_kind
+from es_service.protocol.machine import cores, cpu_kind
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import evaluation
 from es_service.runs.view import Run

@@ -30,10 +30,9 @@ from es_service import api
 from es_service.cli.bench import bench_rollouts
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
-from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.protocol.machine import cpu_kind, platform_info
+from es_service.protocol.machine import cores, cpu_kind, platform_info
 from es_service.protocol.process_environment import same_imports
 from tests.benchmarks import vector_env
 from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, python_of, their_versions, there_are

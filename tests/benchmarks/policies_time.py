@@ -31,15 +31,13 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
-from es_service.protocol.episodes import addressed
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.loop.state import no_observations
+from es_service.protocol.episodes import DispatchCounts, addressed, together
 from es_service.protocol.messages import EpisodesResult, Work, WorkerSpec
-from es_service.protocol.pieces import together
 from es_service.protocol.policies import POLICIES_TOGETHER, PolicyChunk, slots
 from es_service.protocol.sent import Memory, Received, parcel
 from es_service.protocol.wire import framed
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore

@@ -43,9 +43,8 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.loop.policies import no_statistics, policy_work
-from es_service.protocol.episodes import gathered
-from es_service.protocol.evaluator import Evaluator
+from es_service.loop.contents import no_statistics, policy_work
+from es_service.protocol.episodes import Evaluator, gathered
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk, WorkerSpec, with_subject
 from tests.helpers import centre
 from workers.environments import Environment

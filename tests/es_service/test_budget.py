@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from es_service import api
 from es_service import sweep as api_sweep
 from es_service.cli.main import app
-from es_service.dispatch.computing import Computing
 from es_service.dispatch.events import Compiled, Limits, Result, Submit, WorkerLost
 from es_service.dispatch.scheduler_state import initial_state
+from es_service.dispatch.waits import Computing
 from es_service.errors import ConfigError
-from es_service.loop import budget, clock, driver
+from es_service.loop import budget, driver
 from es_service.loop.budget import durations, only_started, spent
 from es_service.loop.history import LATER
 from es_service.runs.run_status import more, read_status, state
@@ -141,12 +141,12 @@ def slow(monkeypatch):
     """A clock by which each generation takes 10 s."""
     now = [0.0]
 
-    class Slow(clock.Clock):
+    class Slow(budget.Clock):
         def lap(self, name):
             now[0] += 5.0 if name == "seconds_evaluation" else 0.0  # twice in a generation
             super().lap(name)
 
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(driver, "Clock", Slow)
 
 

@@ -13,7 +13,7 @@ from es_service.config.tasks import TASKS
 from es_service.errors import TaskError
 from es_service.protocol.child import Child, NoAnswerError, answer_of
 from es_service.protocol.process_environment import DEPTH, MOST_DEPTH, child_environment, require_no_import_of_a_task
-from es_service.protocol.raised import RaisedError
+from es_service.protocol.user_code import RaisedError
 
 SHELL = "tests.es_service.shell_child"
 LONG_S = 60.0

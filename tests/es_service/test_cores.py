@@ -8,7 +8,7 @@ import pytest
 
 from es_service.api import load_config
 from es_service.cli import bench, doctor
-from es_service.dispatch import cores
+from es_service.protocol import machine
 from es_service.runs.worker_count import worker_count
 
 SMALLEST = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
@@ -18,8 +18,8 @@ SMALLEST = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}
 def write(tmp_path, monkeypatch):
     """Writes files into what eight cores are said to be limited by."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    monkeypatch.setattr(cores, "CGROUP", tmp_path)
-    monkeypatch.setattr(cores, "MEMBERSHIP", tmp_path / "membership")
+    monkeypatch.setattr(machine, "CGROUP", tmp_path)
+    monkeypatch.setattr(machine, "MEMBERSHIP", tmp_path / "membership")
 
     def write(files):
         for name, text in files.items():
@@ -45,7 +45,7 @@ def write(tmp_path, monkeypatch):
 )
 def test_a_quota_of_either_version_limits_the_cores(write, files, expected):
     write(files)
-    assert cores.cores() == expected
+    assert machine.cores() == expected
 
 
 IN_A_JOB = "0::/slurm/job_7/step_0\n"
@@ -95,7 +95,7 @@ OF_VERSION_1 = "3:cpuset:/other\n2:cpu,cpuacct:/slurm/job_7\n1:name=systemd:/sys
 )
 def test_the_least_quota_of_the_groups_around_a_process_limits_the_cores(write, files, expected):
     write(files)
-    assert cores.cores() == expected
+    assert machine.cores() == expected
 
 
 def test_whoever_counts_cores_knows_of_the_quota(write, monkeypatch):

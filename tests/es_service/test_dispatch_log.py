@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log
+from es_service.dispatch.events import FILE, Committed, dispatch_log
 from es_service.errors import StoreError
 from tests.dispatch_checker import read_dispatch_log
 

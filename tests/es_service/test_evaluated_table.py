@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.loop.evaluated import told_of_asks
 from es_service.loop.history import episodes_table, evaluation_columns
-from es_service.loop.policies import no_statistics, policy_work
 from es_service.protocol.messages import EpisodesResult, PolicySpec, TaskSpec
 from es_service.search.algorithms.base import PolicyAsk
 

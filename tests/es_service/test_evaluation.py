@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.api import open_run
-from es_service.protocol.episodes import addressed
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.episodes import DispatchCounts, addressed
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk
 from es_service.runs import evaluation
 from tests.run_examples import write_run

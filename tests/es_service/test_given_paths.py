@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import es_service
 from es_service.cli.main import app
 from es_service.config.given import shipped_text
-from es_service.protocol.system import given_path
+from es_service.protocol.machine import given_path
 from es_service.report import plots
 from es_service.runs.tracking import tracked
 from tests.system.session import SMALL

@@ -10,10 +10,10 @@ import pytest
 from es_service import load_config
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
-from es_service.dispatch import cores
-from es_service.dispatch.cores import places
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
+from es_service.protocol import machine
+from es_service.protocol.machine import places
 from es_service.protocol.messages import TrainingChunk
 from tests.helpers import centre
 
@@ -35,7 +35,7 @@ def test_workers_have_as_many_places_as_visible_gpus_have_room(visible, share, e
 
 
 def test_all_gpus_are_visible_unless_the_environment_names_some(tmp_path, monkeypatch):
-    monkeypatch.setattr(cores, "DEVICES", tmp_path)
+    monkeypatch.setattr(machine, "DEVICES", tmp_path)
     assert places({}, 1) == ()
     for name in ("nvidia3", "nvidia0", "nvidiactl", "nvidia-uvm"):
         (tmp_path / name).touch()

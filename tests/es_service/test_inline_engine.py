@@ -22,9 +22,9 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.raised import RaisedError
 from es_service.protocol.recipes import Recipes
 from es_service.protocol.sent import LEAST_BYTES, Received
+from es_service.protocol.user_code import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 

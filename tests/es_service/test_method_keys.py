@@ -20,7 +20,7 @@ from es_service.config.tasks import TASKS
 from es_service.config.text import dump_yaml, parse_value, read_yaml_file
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.parameters import FREE, ParameterSpec
+from es_service.protocol.options import FREE, ParameterSpec
 from es_service.runs.lineage import fork_config
 from es_service.runs.sweep_plan import plan
 from es_service.search.algorithms import ALGORITHMS, OURS

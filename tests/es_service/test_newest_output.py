@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from es_service.protocol.newest_output import NewestOutput
+from es_service.protocol.process_environment import NewestOutput
 
 MOST = 100_000
 LOUD = """

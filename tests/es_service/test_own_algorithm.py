@@ -9,13 +9,13 @@ import pytest
 
 from es_service import api
 from es_service.errors import ConfigError, EvaluationError, StoreError
+from es_service.loop.state import no_observations
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, CentreEvaluation
 from es_service.search.algorithms.common import add_to_archive, first_state
 from es_service.search.maps.behaviour_map import COLUMNS, insert
 from es_service.search.novelty import NoveltyArchive
-from es_service.search.observation_statistics import no_observations
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 

@@ -15,7 +15,7 @@ from es_service import api
 from es_service.dispatch.events import because
 from es_service.dispatch.ray_calls import raised_in_actor
 from es_service.errors import ConfigError
-from es_service.protocol.raised import RaisedError, raised, users_error
+from es_service.protocol.user_code import RaisedError, raised, users_error
 from tests.system.command_line import PROGRAM, command
 from workers.simd.graph.graph import UnsupportedError
 
@@ -197,7 +197,7 @@ def test_a_package_beside_the_libraries_is_the_user_s_if_it_is_named(tmp_path):
     (package / "installed.py").write_text("def f():\n    return 1 / 0\n")
     script = (
         f"import sys; sys.path.append({str(package)!r}); import installed\n"
-        "from es_service.protocol.raised import users_error\n"
+        "from es_service.protocol.user_code import users_error\n"
         "try: installed.f()\n"
         "except ZeroDivisionError as error:\n"
         "    error.__traceback__ = error.__traceback__.tb_next\n"

@@ -23,7 +23,7 @@ from es_service.dispatch.ray_calls import IN_CALL_BYTES
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE
 from es_service.errors import EvaluationError
-from es_service.loop.policies import no_statistics, policy_work
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import Work
 from es_service.protocol.noise import Domain, stream_keys

@@ -21,7 +21,7 @@ from es_service.config.workload import worker_spec
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol.machine import CODE, is_mixed, platform_info
+from es_service.protocol.machine import CODE, architecture, is_mixed, platform_info
 from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.sources import (
     OtherCodeError,
@@ -32,7 +32,6 @@ from es_service.protocol.sources import (
     why_refused,
     worker_sources,
 )
-from es_service.protocol.system import architecture
 from es_service.runs.identity import code_of, require_unchanged, tell_of_other_code
 from tests.helpers import SPEC, centre, random_parameters
 from workers.actor import WorkerActor

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from es_service.search.observation_statistics import merge_moments, no_observations
+from es_service.loop.state import merge_moments, no_observations
 
 
 def test_merged_moments_equal_those_of_all_observations_at_once():

@@ -12,9 +12,9 @@ import pytest
 
 import es_service
 from es_service.dispatch import inline_engine as inline_module
-from es_service.dispatch.cores import cores
 from es_service.dispatch.staying import IDLE_PER_CORE, Staying, staying, workers
 from es_service.protocol.child import Child
+from es_service.protocol.machine import cores
 from es_service.protocol.process_environment import child_environment
 from tests.helpers import workers_in_this_process
 from tests.system.processes import is_running

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from es_service.protocol import machine, system
+from es_service.protocol import machine
 from es_service.store.folder import is_network_filesystem
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +51,7 @@ def test_every_question_has_an_answer_without_what_only_linux_has() -> None:
 
 
 def test_a_process_starts_when_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    exactly = system.process_start_s()
+    exactly = machine.process_start_s()
     assert exactly <= time.time()
 
     def no_file(path: Path) -> str:
@@ -60,10 +60,10 @@ def test_a_process_starts_when_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "read_text", no_file)
     ages = {"05": 5, "01:02\n": 62, " 03:00:01": 10801, "2-00:00:00": 172800}
     for said, age in ages.items():
-        monkeypatch.setattr(system, "_said", lambda *command, said=said: said)
-        assert system.process_start_s() == pytest.approx(time.time() - age - 1, abs=1)
-    monkeypatch.setattr(system, "_said", lambda *command: "")
-    assert system.process_start_s() == 0.0
+        monkeypatch.setattr(machine, "_said", lambda *command, said=said: said)
+        assert machine.process_start_s() == pytest.approx(time.time() - age - 1, abs=1)
+    monkeypatch.setattr(machine, "_said", lambda *command: "")
+    assert machine.process_start_s() == 0.0
 
 
 @pytest.mark.slow
@@ -102,14 +102,14 @@ nas:/export on /Volumes/nfs (nfs)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says it of a process alone")
 def test_the_memory_of_a_process_is_not_that_of_the_one_that_started_it() -> None:
     large = bytearray(os.urandom(1 << 20) * 300)
-    code = "from es_service.protocol.system import peak_memory_mib; print(peak_memory_mib())"
+    code = "from es_service.protocol.machine import peak_memory_mib; print(peak_memory_mib())"
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert 5 < int(printed) < len(large) >> 20 <= system.peak_memory_mib()
+    assert 5 < int(printed) < len(large) >> 20 <= machine.peak_memory_mib()
 
 
 def test_mounts_of_macos(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("es_service.store.folder.mounts", lambda: system.mounts_of_macos(MACOS))
-    assert [kind for _, kind in system.mounts_of_macos(MACOS)] == ["apfs", "apfs", "autofs", "smbfs", "nfs"]
+    monkeypatch.setattr("es_service.store.folder.mounts", lambda: machine.mounts_of_macos(MACOS))
+    assert [kind for _, kind in machine.mounts_of_macos(MACOS)] == ["apfs", "apfs", "autofs", "smbfs", "nfs"]
     for folder, is_network in {"/Volumes/my runs/a": True, "/Volumes/nfs": True, "/Users/me": False}.items():
         assert is_network_filesystem(Path(folder)) is is_network
 

@@ -3,9 +3,9 @@
 from es_service.api import load_config
 from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
+from es_service.loop.state import no_observations
 from es_service.protocol.messages import EpisodesResult, PolicySpec
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters

@@ -7,10 +7,10 @@ import numpy as np
 from es_service.api import load_config
 from es_service.config.workload import worker_spec
 from es_service.loop import driver
+from es_service.loop.state import no_observations
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore, rows_of
 from tests.references.behaviour_map import cell_number
 from workers.environments import SHIPPED

@@ -15,7 +15,7 @@ from es_service import api
 from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, RunLockedError, StoreError
-from es_service.loop.policies import policy_work
+from es_service.loop.contents import policy_work
 from es_service.protocol.content import OF_POLICY
 from es_service.protocol.episodes import gathered
 from es_service.protocol.machine import platform_info

@@ -11,8 +11,8 @@ from es_service.api import load_config
 from es_service.config.workload import worker_spec
 from es_service.errors import EvaluationError
 from es_service.loop import driver
-from es_service.protocol.episodes import addressed
-from es_service.protocol.evaluator import DispatchCounts
+from es_service.loop.state import merge_moments, no_observations
+from es_service.protocol.episodes import DispatchCounts, addressed
 from es_service.protocol.messages import (
     EpisodesResult,
     GradientChunk,
@@ -22,7 +22,6 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import merge_moments, no_observations
 from tests.helpers import AtTheEnd, MemoryStore
 from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
 from tests.references import es as reference

@@ -31,7 +31,7 @@ POLICIES = {
     "es_service.protocol.content.Policy": "the form, from a search's map to an export",
     "es_service.protocol.messages.Centre": "as sent to workers, with the noise around it",
     "es_service.protocol.policies.Policies": "as sent to workers, several side by side",
-    "es_service.loop.policies.PolicyWork": "what is asked for, and the messages that it became",
+    "es_service.loop.contents.PolicyWork": "what is asked for, and the messages that it became",
     "es_service.search.algorithms.base.PolicyAsk": "several that a search asks for",
     "es_service.search.algorithms.base.CentreState": "a centre of a search, with the state of its step",
     "workers.asked_rows.Rows": "a row for each episode that a caller computes",

@@ -5,12 +5,12 @@ import pytest
 
 from es_service.loop.arrays import value_of
 from es_service.loop.history import history_columns
+from es_service.loop.state import normalisation
 from es_service.protocol.content import as_bytes
 from es_service.protocol.messages import EvaluationChunk, GradientChunk, Moments, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import NO_CELL
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
-from es_service.search.observation_statistics import normalisation
 from es_service.store.codec import decode_part, encode_part
 from tests.helpers import map_of
 from tests.laws.me_es_runs import (

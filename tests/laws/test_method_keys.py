@@ -15,10 +15,10 @@ from es_service.config.tasks import TASKS
 from es_service.config.workload import policy_spec, worker_spec
 from es_service.loop import driver
 from es_service.loop.history import history_columns
+from es_service.loop.state import no_observations
 from es_service.protocol.content import name_of
 from es_service.search import algorithms
 from es_service.search.algorithms import ALGORITHMS, OURS
-from es_service.search.observation_statistics import no_observations
 from tests.es_service.config_examples import load_config
 from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering

@@ -8,6 +8,7 @@ from es_service.config.parts import Ranks, Returns
 from es_service.config.workload import worker_spec
 from es_service.loop.arrays import state_of
 from es_service.loop.checks import invalidate
+from es_service.loop.state import no_observations
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
@@ -19,7 +20,6 @@ from es_service.search.algorithms.common import (
     novelty_of_centres,
 )
 from es_service.search.algorithms.nsra_es import adapted_weight
-from es_service.search.observation_statistics import no_observations
 from es_service.search.shaping import utilities, weighted
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws import me_es_runs

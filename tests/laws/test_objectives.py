@@ -14,7 +14,7 @@ from es_service.config.parts import (
     TargetObjective,
 )
 from es_service.loop.generation import halves
-from es_service.protocol.evaluator import completed
+from es_service.protocol.episodes import completed
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.common import first_state, scheduled

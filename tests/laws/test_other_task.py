@@ -16,7 +16,7 @@ from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, StoreError
-from es_service.loop.policies import policy_work
+from es_service.loop.contents import policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, seed_for

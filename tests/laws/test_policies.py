@@ -10,7 +10,7 @@ import pytest
 
 from es_service import api
 from es_service.errors import EvaluationError
-from es_service.loop.policies import no_statistics, policy_work
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import PolicyChunk
 from es_service.search.algorithms import ALGORITHMS

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import EvaluationError
-from es_service.loop.policies import no_statistics, policy_work
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.messages import Policies, with_subject
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk

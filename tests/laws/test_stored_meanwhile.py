@@ -7,14 +7,14 @@ import pytest
 
 from es_service.errors import EvaluationError
 from es_service.loop import driver
-from es_service.loop.clock import Clock
+from es_service.loop.budget import Clock
 from es_service.loop.contents import Contents
 from es_service.loop.generation import initial_state
 from es_service.loop.interfaces import Stop
-from es_service.protocol.evaluator import completed
+from es_service.loop.state import no_observations
+from es_service.protocol.episodes import completed
 from es_service.protocol.messages import EvaluationChunk
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
 from tests.laws.me_es_runs import Remembering, Sharing, first_centres
 from tests.laws.test_map_elites import config_of
 from workers.environments import SHIPPED

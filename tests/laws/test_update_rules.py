@@ -10,7 +10,7 @@ from es_service.api import load_config
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, Ranks, Returns, Signs, TopPairs
 from es_service.config.workload import worker_spec
 from es_service.loop.generation import estimate_gradients
-from es_service.protocol.evaluator import completed
+from es_service.protocol.episodes import completed
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import centred_ranks, pair_signs, pair_weights, shaped, standardised

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import yaml
 
-from es_service.dispatch.dispatch_log import FILE
+from es_service.dispatch.events import FILE
 from tests.system.chaos_tally import Tally
 from tests.system.cluster import PORT, RAY_SETTINGS, Machines, children_of, join, ray_start
 

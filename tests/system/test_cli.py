@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from es_service import open_run
-from es_service.dispatch.cores import cores
+from es_service.protocol.machine import cores
 from tests.system.command_line import PROGRAM, digest, es
 from tests.system.session import ROOT, SMALL
 

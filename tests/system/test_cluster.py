@@ -20,7 +20,7 @@ import pytest
 import yaml
 
 from es_service import api
-from es_service.dispatch.dispatch_log import FILE
+from es_service.dispatch.events import FILE
 from es_service.protocol import sources
 from es_service.protocol.machine import CODE
 from es_service.store.digest import digest_parts

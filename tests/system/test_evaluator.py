@@ -20,7 +20,7 @@ from es_service import api
 from es_service.dispatch.inline_engine import ChildProcesses
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import ConfigError, EvaluationError, ServiceError
-from es_service.loop.policies import no_statistics
+from es_service.loop.contents import no_statistics
 from tests.helpers import stop, workers_in_this_process
 from tests.system import cluster
 from tests.system.cluster import Cluster

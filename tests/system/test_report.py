@@ -252,7 +252,7 @@ def test_a_long_run_with_a_large_map_is_reported_in_seconds(page, tmp_path):
     folder = write_run(tmp_path / "run", {"map.cells": [50, 50]}, generations=8000, filled=1.0)
     code = (
         "import sys, time; from es_service.cli.main import main; sys.argv[1:] = ['report', sys.argv[1]]\n"
-        "from es_service.protocol.system import peak_memory_mib\n"
+        "from es_service.protocol.machine import peak_memory_mib\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(time.process_time(), peak_memory_mib())"
     )

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.loop.policies import policy_work
+from es_service.loop.contents import policy_work
 from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk, Work, with_subject
 from tests.helpers import centre, random_parameters, spec
 from tests.workers.test_worker import bits

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import workers.rollout
-from es_service.protocol.low_rank import LayerNoise, layers_of_noise, noise_integers, numbers
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
+from es_service.protocol.policy_spec import LayerNoise, layers_of_noise, noise_integers, numbers
 from tests import helpers
 from tests.helpers import centre, chunk_runner, random_parameters
 from workers.host.policies import gradient_summer, members

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.loop.policies import no_statistics, policy_work
+from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, WorkerSpec
 from es_service.protocol.noise import Domain, stream_keys

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.loop.policies import policy_work
+from es_service.loop.contents import policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from es_service.protocol.errors import TaskError
+from es_service.protocol.machine import memory_of_tree_bytes
 from es_service.protocol.messages import EpisodesResult, Moments, Report
-from es_service.protocol.newest_output import cut
-from es_service.protocol.system import memory_of_tree_bytes
+from es_service.protocol.process_environment import cut
 from es_service.runs.engine import reader_of_reports
 from es_service.store.lock import MOST_LINE, MOST_LINES, acquire_lock, last_output, lock_holder
 from tests.helpers import spec

@@ -36,9 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import Bounds, FloatArray, TaskSpec
-from es_service.protocol.options import OptionValue, declared_options
+from es_service.protocol.options import FREE, OptionValue, ParameterSpec, declared_options
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
-from es_service.protocol.parameters import FREE, ParameterSpec
 from workers.environments import TaskError
 from workers.environments.declared import (
     are_finite,

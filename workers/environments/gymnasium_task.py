@@ -31,9 +31,8 @@ import numpy as np
 
 from es_service.protocol.messages import HostChoices, TaskSpec
 from es_service.protocol.options import Option, OptionValue
-from es_service.protocol.raised import users_error, why_not_imported
 from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE, user_path
-from es_service.protocol.user_code import import_user_module
+from es_service.protocol.user_code import import_user_module, users_error, why_not_imported
 from workers.environments import TaskError
 from workers.environments.declared import describe_descriptor
 from workers.environments.host_metrics import missing_metrics, with_metrics

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import Bounds, FloatArray, HostChoices
-from es_service.protocol.raised import raised
+from es_service.protocol.user_code import raised
 from workers.environments import TaskError
 
 IS_SUCCESS = "is_success"

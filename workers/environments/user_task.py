@@ -55,7 +55,7 @@ import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, declared_options, option_values
-from es_service.protocol.raised import raised
+from es_service.protocol.user_code import raised
 from workers.environments import Environment, TaskError
 from workers.environments.declared import (
     KEPT_ATTRIBUTES,

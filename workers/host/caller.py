@@ -14,7 +14,7 @@ from es_service.protocol.child import Child, NoAnswerError, answer_parent
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.options import OptionValue
 from es_service.protocol.process_environment import same_imports
-from es_service.protocol.raised import RaisedError
+from es_service.protocol.user_code import RaisedError
 from workers.environments import make_function_task
 from workers.environments.function_task import FunctionTask
 from workers.reports import Tail

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from es_service.protocol.child import answer_parent
+from es_service.protocol.machine import peak_memory_mib
 from es_service.protocol.messages import HostChoices, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.rollouts import choose
-from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
 from workers.environments import choices_of, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.outputs import METRICS
-from es_service.protocol.raised import raised
+from es_service.protocol.user_code import raised
 from workers import progress
 from workers.environments.function_task import FunctionTask
 from workers.host.caller import CallFailedError

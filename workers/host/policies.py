@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.low_rank import noise_integers
 from es_service.protocol.messages import SIGNS, FloatArray, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
+from es_service.protocol.policy_spec import noise_integers
 from workers.policies.policy import Layers, act, action, drawn_action, initial_memory, normalise, split_layers
 
 

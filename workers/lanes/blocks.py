@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from es_service.protocol.child import Child, NoAnswerError
 from es_service.protocol.options import OptionValue
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.raised import RaisedError
+from es_service.protocol.user_code import RaisedError
 from workers.environments import Environment, TaskError
 from workers.xla_cache import xla_cache_settings
 

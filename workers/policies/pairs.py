@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol.low_rank import layers_of_noise, product_unit
 from es_service.protocol.messages import SIGNS, PolicySpec
+from es_service.protocol.policy_spec import layers_of_noise, product_unit
 from workers.policies.policy import act, split_layers
 
 SIGNS_S = np.asarray(SIGNS, np.float32)

@@ -23,8 +23,7 @@ from functools import partial
 from es_service.config.model import RunConfig
 from es_service.config.search import SearchConfig
 from es_service.errors import ConfigError
-from es_service.protocol.raised import raised, why_not_imported
-from es_service.protocol.user_code import import_user_module, in_no_file
+from es_service.protocol.user_code import import_user_module, in_no_file, raised, why_not_imported
 from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.settings import UndeclaredSettings
 

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
-from es_service.protocol.policy_spec import Activation, PolicySpec
+from es_service.protocol.policy_spec import Activation, PolicySpec, layers_of_noise, numbers, product_unit
 from workers.simd.backend.native import Words, aligned, pack, require_same
 from workers.simd.episodes.compiled import EpisodeKernel
 from workers.simd.episodes.hidden import activated_node

@@ -1,4 +1,4 @@
-"""Code of policies whose noise has low rank (`es_service.protocol.low_rank`), for a block of members, two of each pair.
+"""Code of policies whose noise has low rank (`protocol/policy_spec.py`), for a block of members, two of each pair.
 
 All members share the weights of the centre. What a member has of its own is in the beginning of each sum:
 
@@ -25,9 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.low_rank import layers_of_noise, numbers, product_unit
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
-from es_service.protocol.policy_spec import PolicySpec
+from es_service.protocol.policy_spec import PolicySpec, layers_of_noise, numbers, product_unit
 from workers.compilable import Compilable
 from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same

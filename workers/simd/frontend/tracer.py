@@ -21,7 +21,7 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
-from es_service.protocol.raised import is_users_file
+from es_service.protocol.user_code import is_users_file
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.graph import UnsupportedError, refusing, way_round
 from workers.simd.graph.loops import build_loop, build_while
