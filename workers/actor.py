@@ -151,5 +151,7 @@ def remove_old_logs(own: Path) -> None:
         if not Path("/proc", log.stem.rpartition("-")[2]).exists()
     ]
     for log in sorted(logs, key=lambda log: log.stat().st_mtime)[:-KEPT_LOGS]:
-        for file in (log, log.with_suffix(".err")):
+        _, worker, _, process = log.stem.split("-")
+        of_ray = log.with_name(f"python-core-worker-{worker}_{process}.log")
+        for file in (log, log.with_suffix(".err"), of_ray):
             file.unlink(missing_ok=True)

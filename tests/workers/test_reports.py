@@ -107,16 +107,22 @@ def test_the_newest_lines_are_read_by_others_and_the_first_replacement_is_a_noti
     assert notice.startswith("worker 4 is replaced by a new process, since it leaks. Later replacements are in the log")
 
 
+def files_of(worker):
+    """Files of a worker of Ray, whose output is named worker-ID-JOB-PROCESS."""
+    _, number, _, process = worker.split("-")
+    return f"{worker}.out", f"{worker}.err", f"python-core-worker-{number}_{process}.log"
+
+
 def test_of_the_output_of_ended_workers_of_a_job_the_newest_files_stay(tmp_path):
     ended = subprocess.Popen(["true"])
     ended.wait()
     names = [f"worker-{number:02}-01000000-{ended.pid}" for number in range(KEPT_LOGS + 3)]
     others = [f"worker-aa-02000000-{ended.pid}", f"worker-bb-01000000-{os.getpid()}"]
     for number, name in enumerate([*others, *names]):
-        for kind in ("out", "err"):
-            (tmp_path / f"{name}.{kind}").touch()
-            os.utime(tmp_path / f"{name}.{kind}", (number, number))
+        for file in files_of(name):
+            (tmp_path / file).touch()
+            os.utime(tmp_path / file, (number, number))
     remove_old_logs(Path("pipe:[1]"))  # where a process that is none of Ray's prints
     remove_old_logs(tmp_path / f"{others[1]}.out")
     left = {file.name for file in tmp_path.iterdir()}
-    assert left == {f"{name}.{kind}" for name in [*others, *names[3:]] for kind in ("out", "err")}
+    assert left == {file for name in [*others, *names[3:]] for file in files_of(name)}
