@@ -18,7 +18,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from es_service.loop.state import RunState
-from es_service.protocol.content import Arrays, names_in
+from es_service.protocol.content import NAME, NO_NAME, Arrays, as_bytes, names_in
 from es_service.search.algorithms.base import SearchState, frozen
 from es_service.search.arrays import same, same_rows
 
@@ -60,13 +60,23 @@ def changes(state: RunState, before: RunState | None) -> dict[str, Arrays | None
     Contents are compared, so that no change is lost, however it was made; only the same object is taken for unchanged,
     since its arrays are read-only.
     """
-    now, then = (dict(_nodes(tree_of(one), "")) if one is not None else {} for one in (state, before))
     differing: dict[str, Arrays | None] = {}
-    for path in [*now, *(then.keys() - now.keys())]:
-        owner, owner_then = now.get(path), then.get(path)
-        if owner is not owner_then:
-            _compare(path, _arrays(owner), _arrays(owner_then), differing)
+    for path, now, then in _pairs(state, before):
+        _compare(path, _arrays(now), _arrays(then), differing)
     return differing
+
+
+def new_names(state: RunState, before: RunState | None) -> frozenset[bytes]:
+    """Names that a state has where it differs from the one before; another row may have had them."""
+    found: set[bytes] = set()
+    for _, now, then in _pairs(state, before):
+        earlier = _arrays(then) or {}
+        for name, array in (_arrays(now) or {}).items():
+            if array.dtype == NAME:
+                now_N, then_N = array.reshape(-1), earlier.get(name, np.zeros(0, NAME)).reshape(-1)
+                both = min(now_N.size, then_N.size) if then_N.dtype == NAME else 0
+                found |= {*as_bytes(now_N[:both][now_N[:both] != then_N[:both]]), *as_bytes(now_N[both:])}
+    return frozenset(found) - {NO_NAME}
 
 
 def names_of(blocks: Changes) -> frozenset[bytes]:
@@ -194,16 +204,33 @@ def _is_group(value: object) -> bool:
     return isinstance(value, tuple) and bool(value) and _is_node(value[0])
 
 
-def _nodes(owner: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """The paths and owners of all nodes of a tree but its root."""
-    for name, value in _children(owner).items():
+def _pairs(state: RunState, before: RunState | None) -> Iterator[tuple[str, Any, Any]]:
+    """Path and owners of each node that is not the same object in both states; None for one that is not there."""
+    return _pairs_below(tree_of(state), None if before is None else tree_of(before), "")
+
+
+def _pairs_below(now: Any, then: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """The same of the nodes of two trees but their roots. What is the same object has the same nodes below."""
+    children, earlier = (_children(owner) if owner is not None else {} for owner in (now, then))
+    for name in [*children, *(earlier.keys() - children.keys())]:
+        value, before = children.get(name), earlier.get(name)
+        if value is before:
+            continue
         at = f"{path}/{name}" if path else name
-        for where, node in (
-            [(f"{at}/{number}", member) for number, member in enumerate(value)] if _is_group(value) else [(at, value)]
-        ):
-            if _is_node(node):
-                yield where, node
-                yield from _nodes(node, where)
+        members = {where: (node, None) for where, node in _members(at, value)}
+        for where, node in _members(at, before):
+            members[where] = members.get(where, (None, None))[0], node
+        for where, (node, node_then) in members.items():
+            if node is not node_then:
+                yield where, node, node_then
+                yield from _pairs_below(node, node_then, where)
+
+
+def _members(path: str, value: Any) -> list[tuple[str, Any]]:
+    """The nodes that a child is: itself, the members of a group, or none."""
+    if _is_group(value):
+        return [(f"{path}/{number}", member) for number, member in enumerate(value)]
+    return [(path, value)] if _is_node(value) else []
 
 
 def _arrays(owner: Any) -> dict[str, np.ndarray] | None:

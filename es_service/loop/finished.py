@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.arrays import Changes, changes, names_of
+from es_service.loop.arrays import Changes, changes, new_names
 from es_service.loop.budget import MOST_DURATIONS, Clock, durations
 from es_service.loop.checks import require_known, require_storable
 from es_service.loop.contents import Named
@@ -122,7 +122,7 @@ def finish(
     stored = before if before.generation >= 0 else None
     require_storable(state, stored)
     parts = changes(state, stored)
-    names = names_of(parts)
+    names = new_names(state, stored)
     contents = {name: content for name, content in named.contents.items() if name in names}
     require_known(names.difference(contents), stored, generation)
     clock.lap("seconds_driver")

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.loop.arrays import changes, names_of, state_of, stored
+from es_service.loop.arrays import changes, names_of, new_names, state_of, stored
 from es_service.loop.state import Best, RunState
 from es_service.protocol.content import name_of, names
 from es_service.protocol.messages import Moments
@@ -308,6 +308,14 @@ def test_the_same_is_written_after_a_resume_and_what_has_not_changed_is_not(cour
         assert {name for name, part in straight.items() if part is None} == then.keys() - now.keys()
         written = {name for name, part in straight.items() if part is not None}
         assert differing == written
+
+
+@settings(max_examples=15)
+@given(courses, seeds)
+def test_new_names_are_those_that_the_state_before_has_not_and_perhaps_others_of_what_differs(course, seed):
+    for before, state in pairwise([None, *every_state(seed, course)]):
+        had = frozenset() if before is None else names_of(stored(before))
+        assert names_of(stored(state)) - had <= new_names(state, before) <= names_of(changes(state, before))
 
 
 def same(now, then):
