@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from es_service.cli.main import app
 from tests.examples import tutorial
 
+pytestmark = pytest.mark.filterwarnings("ignore:compiling for river:RuntimeWarning")  # on a busy machine
+
 
 @pytest.fixture
 def read(tmp_path, monkeypatch):
