@@ -10,7 +10,7 @@ import numpy as np
 
 from es_service.protocol.messages import Segment
 from workers.environments import ant, ant_tasks
-from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
+from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS
 from workers.environments.ant_tasks import WALL_RADIUS
 from workers.environments.brax_task import Transform
 
@@ -24,13 +24,16 @@ CLEAR_M = 1.0
 """Between a start and the nearest wall's surface: no leg of an ant reaches further from its torso's surface."""
 
 
-def colliders(system: Any, state: AntState) -> jax.Array:
-    """Torso and both ends of every lower leg in the plane, [9, 2]."""
-    x = expand(system, state).x
-    points = [x.pos[0]]
-    for link, sign_x, sign_y in LOWER_LEGS:
+def colliders(x: Transform) -> jax.Array:
+    """Torso and both ends of every lower leg in the plane, [9, 2].
+
+    Args:
+        x: where the torso and then the bodies of each leg are, of Brax's ant [9] or of MuJoCo's [13].
+    """
+    points, bodies = [x.pos[0]], (len(x.pos) - 1) // len(LOWER_LEGS)
+    for leg, (_, sign_x, sign_y) in enumerate(LOWER_LEGS, start=1):
         end = jnp.array([sign_x * LEG_LENGTH, sign_y * LEG_LENGTH, 0.0])
-        points += [x.pos[link], x.take(link).do(Transform.create(pos=end)).pos]
+        points += [x.pos[leg * bodies], x.take(leg * bodies).do(Transform.create(pos=end)).pos]
     return jnp.stack(points)[:, :2]
 
 

@@ -87,8 +87,9 @@ OTHER_TASKS = (
     "module:Class"
 )
 """Names of tasks that are not shipped, in words."""
-DESCRIBE_S = 120.0
-"""Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
+DESCRIBE_S = 300.0
+"""Longest wait for a description, in seconds: for the first time, to see whether simd can compile a humanoid of MuJoCo
+takes a minute of a processor, and longer on a busy machine."""
 REPEATS_S = 20.0
 """Longest time of a trial whether it repeats itself."""
 

@@ -1,114 +1,140 @@
 """Do walls hold for whole episodes? Two thousand ants per task, beside walls, driven as hard as their motors go.
 
-    python -m tests.benchmarks.walls_hold            # 11 minutes on two cores; rewrites results/walls_hold.csv
+    python -m tests.benchmarks.walls_hold                          # all rows of results/walls_hold.csv
+    python -m tests.benchmarks.walls_hold ant_trap --physics mujoco    # only those
 
-Half of the ants take a random action every step, half turn every motor fully one way or the other for half a second.
-Not a benchmark of speed: it lives here because it takes too long for a test. `tests/workers/test_ant_walls.py` drives
-fewer steps, with forces from outside.
+Half of the ants take a random action every step, half turn every motor fully one way or the other for half a second, in
+Brax's springs and, where a task has it, in MuJoCo's physics. Episodes are computed by simd. Not a benchmark of speed:
+it lives here because it takes too long for a test. `tests/workers/test_ant_walls.py` and `test_ant_mujoco.py` drive
+fewer steps, with forces from outside or thrown at walls.
 """
 
 from __future__ import annotations
 
-import csv
+import argparse
+import itertools
 import multiprocessing
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-EPISODES, BLOCK = 2000, 50
+EPISODES = 2000
 STEPS = {"ant_maze": 3000, "ant_trap": 1000, "ant_u_maze": 1000, "ant_big_maze": 1000, "ant_hardest_maze": 1000}
+PHYSICS = ("spring", "mujoco", "mujoco_euler")
+HAVE_MUJOCO = ("ant_maze", "ant_trap")
+"""Tasks that have all of these; the others have springs."""
 DRIVES = ("random", "full torque")
+HELD = 10
+"""Steps for which motors remain fully turned, half a second."""
 RESULTS = Path(__file__).parent / "results" / "walls_hold.csv"
+KEY = ["task", "physics", "drive"]
 DEEPEST_M = 0.1
 
 
-def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
-    """One block of whole episodes; runs in a process of its own setting."""
+class Record(NamedTuple):
+    """What was seen in an episode until now."""
+
+    deepest: Any
+    """Metres by which a collider was inside a wall; negative: outside."""
+    off_middle: Any
+    """Greatest distance of the torso from the middle of AntMaze's arena, along x or y."""
+    pocket: Any
+    """Greatest reward of AntMaze in the pocket left of its goal."""
+    highest: Any
+    """Greatest height of the torso."""
+    crossed: Any
+    finite: Any
+
+
+def watch(job: tuple[str, str, str]) -> dict[str, Any]:
+    """A row of the table: whole episodes of a task in some physics with a drive, all side by side."""
     import jax
     import jax.numpy as jnp
 
     from es_service.protocol.noise import Domain, stream_keys
     from tests.wall_watch import WALLS, colliders, crosses, depth, places_beside_walls
-    from workers.environments import ant, ant_tasks, goal_maze
-    from workers.environments.ant import make_ant
+    from workers.environments import ant, ant_tasks
+    from workers.environments.goal_maze import WALLS_MET
+    from workers.simd.episodes.kernel import compile_kernel
 
-    if (name, drive) not in _compiled:
-        walls = WALLS[name]
-        ant = make_ant(walls, near=goal_maze.WALLS_MET if name in ant_tasks.MAZES else None)
+    name, physics, drive = job
+    walls, count = WALLS[name], EPISODES // len(DRIVES)
+    of_cells = name in ant_tasks.MAZES
+    made = ant.make_ant(walls, near=WALLS_MET) if of_cells else ant.ant_in(physics, walls)
 
-        def episode(start_key, xy, key):
-            def body(step, carry):
-                state, record = carry
-                if drive == "random":
-                    action = jax.random.uniform(jax.random.fold_in(key, step), (8,), minval=-1, maxval=1)
-                else:
-                    action = jnp.sign(jax.random.uniform(jax.random.fold_in(key, step // 10), (8,)) - 0.5)
-                moved = ant.step(state, action)
-                x, y = moved.q[:2]
-                in_pocket = (x < 10) & (x > 0) & (y < -15) & (name == "ant_maze")
-                reward = -jnp.hypot(x - ant_tasks.MAZE_GOAL[0], y - ant_tasks.MAZE_GOAL[1])
-                now = {
-                    "deepest": jnp.maximum(record["deepest"], depth(colliders(ant.system, moved), walls)),
-                    "crossed": record["crossed"] | crosses(state.q[:2], moved.q[:2], walls),
-                    "finite": record["finite"] & jnp.isfinite(moved.q).all() & jnp.isfinite(moved.qd).all(),
-                    "off_middle": jnp.maximum(record["off_middle"], jnp.abs(moved.q[:2] - ant.MIDDLE).max()),
-                    "pocket": jnp.maximum(record["pocket"], jnp.where(in_pocket, reward, -jnp.inf)),
-                    "highest": jnp.maximum(record["highest"], moved.q[2]),
-                }
-                return moved, now
+    def begin(key: Any, xy: Any) -> tuple[Any, Record]:
+        nothing = jnp.float32(-jnp.inf)
+        record = Record(nothing, nothing, nothing, nothing, crossed=jnp.bool_(False), finite=jnp.bool_(True))
+        return made.reset(key, (xy[0], xy[1])), record
 
-            nothing = jnp.float32(-jnp.inf)
-            record = dict.fromkeys(("deepest", "off_middle", "pocket", "highest"), nothing)
-            record |= {"crossed": jnp.array(False), "finite": jnp.array(True)}
-            state = ant.reset(start_key, (xy[0], xy[1]))
-            return jax.lax.fori_loop(0, STEPS[name], body, (state, record))[1]
+    def advance(begun: tuple[Any, Record], action: Any) -> tuple[Any, Record]:
+        state, record = begun
+        after = made.step(state, action)
+        x, y, height = after.q[:3]
+        in_pocket = (x < 10) & (x > 0) & (y < -15)
+        reward = -jnp.hypot(x - ant_tasks.MAZE_GOAL[0], y - ant_tasks.MAZE_GOAL[1])
+        return after, Record(
+            jnp.maximum(record.deepest, depth(colliders(made.viewer.poses(after)), walls)),
+            jnp.maximum(record.off_middle, jnp.abs(after.q[:2] - ant.MIDDLE).max()),
+            jnp.maximum(record.pocket, jnp.where(in_pocket, reward, -jnp.inf)),
+            jnp.maximum(record.highest, height),
+            record.crossed | crosses(state.q[:2], after.q[:2], walls),
+            record.finite & jnp.isfinite(after.q).all() & jnp.isfinite(after.qd).all(),
+        )
 
-        _compiled[name, drive] = jax.jit(jax.vmap(episode))
-    start_keys = stream_keys(seed, Domain.EVALUATION_RESET, 0, np.arange(BLOCK))
-    keys = jax.random.split(jax.random.PRNGKey(seed), BLOCK)
-    records = _compiled[name, drive](start_keys, places_beside_walls(name, BLOCK, seed), keys)
-    return {"task": name, "drive": drive, **{what: np.asarray(values) for what, values in records.items()}}
-
-
-_compiled: dict[tuple[str, str], Any] = {}
-
-
-def _watch(job: tuple[str, str, int]) -> dict[str, Any]:
-    return watch(*job)
+    seed = DRIVES.index(drive)
+    keys, places = (
+        stream_keys(seed, Domain.EVALUATION_RESET, 0, np.arange(count)),
+        places_beside_walls(name, count, seed),
+    )
+    start = compile_kernel(begin, keys[0], places[0])
+    begun = start(keys, places)
+    step = compile_kernel(advance, jax.eval_shape(begin, keys[0], places[0]), np.zeros(8, np.float32))
+    rng, action_N = np.random.default_rng(seed), np.zeros(0)
+    for number in range(STEPS[name]):
+        if drive == "random" or number % HELD == 0:
+            drawn_N = rng.uniform(-1.0, 1.0, (count, 8)).astype(np.float32)
+            action_N = drawn_N if drive == "random" else np.sign(drawn_N)
+        begun = step(begun, action_N)
+    seen, of_maze = begun[1], name == "ant_maze"
+    return {
+        "task": name,
+        "physics": physics,
+        "drive": drive,
+        "episodes": count,
+        "steps": STEPS[name],
+        "touched_a_wall": int((seen.deepest > 0).sum()),
+        "deepest_m": round(float(seen.deepest.max()), 4),
+        "deeper_than_0.1_m": int((seen.deepest > DEEPEST_M).sum()),
+        "crossed_a_wall": int(seen.crossed.sum()),
+        "left_the_arena": int((seen.off_middle > ant.HALF).sum()) if of_maze else "",
+        "not_finite": int((~seen.finite).sum()),
+        "highest_torso_m": round(float(seen.highest.max()), 2),
+        "best_reward_in_pocket": round(float(seen.pocket.max()), 3) if of_maze else "",
+    }
 
 
 def main() -> None:
-    os.environ |= {"PJRT_NPROC": "1", "JAX_PLATFORMS": "cpu"}  # for the processes below
-    rows = []
-    blocks = EPISODES // len(DRIVES) // BLOCK
-    with multiprocessing.get_context("spawn").Pool(len(os.sched_getaffinity(0))) as pool:
-        for name in STEPS:
-            for number, drive in enumerate(DRIVES):
-                jobs = [(name, drive, number * blocks + block) for block in range(blocks)]
-                results = list(pool.imap(_watch, jobs))
-                joined = {what: np.concatenate([block[what] for block in results]) for what in results[0] if what not in
-                          ("task", "drive")}  # fmt: skip
-                rows.append({
-                    "task": name,
-                    "drive": drive,
-                    "episodes": joined["finite"].size,
-                    "steps": STEPS[name],
-                    "touched_a_wall": int((joined["deepest"] > 0).sum()),
-                    "deepest_m": round(float(joined["deepest"].max()), 4),
-                    "deeper_than_0.1_m": int((joined["deepest"] > DEEPEST_M).sum()),
-                    "crossed_a_wall": int(joined["crossed"].sum()),
-                    "left_the_arena": int((joined["off_middle"] > 37.5).sum()) if name == "ant_maze" else "",
-                    "not_finite": int((~joined["finite"]).sum()),
-                    "highest_torso_m": round(float(joined["highest"].max()), 2),
-                    "best_reward_in_pocket": round(float(joined["pocket"].max()), 3) if name == "ant_maze" else "",
-                })  # fmt: skip
-                print(rows[-1], flush=True)
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tasks", nargs="*", default=list(STEPS), metavar="TASK")
+    parser.add_argument("--physics", nargs="+", default=PHYSICS, choices=PHYSICS)
+    given = parser.parse_args()
+    os.environ |= {"JAX_PLATFORMS": "cpu"}  # for the processes below
+    jobs = [
+        job
+        for job in itertools.product(given.tasks, given.physics, DRIVES)
+        if job[0] in HAVE_MUJOCO or job[1] == "spring"
+    ]
+    found = pd.read_csv(RESULTS, dtype=str).set_index(KEY)
+    with multiprocessing.get_context("spawn").Pool(len(os.sched_getaffinity(0)), maxtasksperchild=1) as pool:
+        for row in pool.imap(watch, jobs, chunksize=1):
+            print(row, flush=True)
+            new = pd.DataFrame([row]).astype(str).set_index(KEY)
+            found = pd.concat([found[~found.index.isin(new.index)], new])
+            found.reset_index().to_csv(RESULTS, index=False, lineterminator="\n")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
 from tests.workers.steps import carried, of_many, pushed, resets_of, steps_of, system_of
 from workers.environments import ant
+from workers.environments.ant import ant_viewer
 from workers.environments.ant_tasks import STEP_S
 
 pytestmark = [
@@ -29,10 +30,10 @@ def watched(request):
     The watch is f(places [N, 2], push [N, 3] as an acceleration of every link, m/s2) -> depth in a wall, whether a way
     crossed one, torso position, whether all is finite; [N, STEPS].
     """
-    name, walls, system = request.param, WALLS[request.param], system_of(request.param)
+    name, walls, viewer = request.param, WALLS[request.param], ant_viewer(system_of(request.param))
     step, begin = steps_of(name), resets_of(name)
     look = of_many(
-        lambda before_2, state: (depth(colliders(system, state), walls), crosses(before_2, state.q[:2], walls))
+        lambda before_2, state: (depth(colliders(viewer.poses(state)), walls), crosses(before_2, state.q[:2], walls))
     )
 
     def watch(places, pushes):

@@ -12,60 +12,18 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol.noise import NORMAL_STD, normal_integers, uniforms
-from workers.environments.mujoco_parts import MjModel, MujocoState, mjx, mujoco
-
-Range = tuple[float, float]
-"""(low, high)."""
-
-
-class Simulated(NamedTuple):
-    """A model, and what a control step of it is."""
-
-    c: MjModel
-    mx: mjx.Model
-    frame_skip: int
-    """Substeps of a control step."""
-    step_s: float
-    """Seconds of a control step."""
-
-    def body(self, name: str) -> int:
-        return mujoco.mj_name2id(self.c, mujoco.mjtObj.mjOBJ_BODY, name)
-
-
-class Feet(NamedTuple):
-    """What the descriptor `feet_contact` counts."""
-
-    touched_F: Any
-    """Number of control steps after which each foot touched the floor."""
-    steps: Any
-    """Number of control steps."""
-
-
-class GymState(NamedTuple):
-    """State of an environment of Gymnasium between two control steps."""
-
-    physics: MujocoState
-    seen: Any
-    """What `look` of the task saw in the last computed substep, any pytree."""
-    feet: Feet | None = None
-    """None with descriptors that do not need it."""
-
-
-class Parts(NamedTuple):
-    """An environment of Gymnasium as functions."""
-
-    start: Callable[[Any], tuple[Any, Any]]
-    """Function from a stream key to the positions [nq] and velocities [nv] of a reset."""
-    observe: Callable[[GymState], Any]
-    """Function from a state to an observation [O]."""
-    outcome: Callable[[GymState, GymState, Any], tuple[Any, Any]]
-    """Function (state, state after a control step, action within the bounds of its actuators) -> (reward, done)."""
-    look: Callable[[Any, bool], Any] = lambda data, stepped: ()
-    """Function (data, whether a step or a reset has computed it) to what a state keeps of MuJoCo's data.
-
-    Data after a step are those of the last forward computation in it: for RK4 its fourth, for Euler of the state before
-    the last substep, while positions and velocities are already those after it. Gymnasium reads them so."""
+from workers.environments.mujoco_contacts import AT_ONCE
+from workers.environments.mujoco_gym_humanoids import humanoid, humanoid_standup
+from workers.environments.mujoco_gym_parts import (
+    GymState,
+    Parts,
+    Range,
+    Simulated,
+    body_forces,
+    inside,
+    noisy,
+    uniforms_at,
+)
 
 
 class GymTask(NamedTuple):
@@ -77,6 +35,8 @@ class GymTask(NamedTuple):
     parts: Callable[..., Parts]
     """Function from a `Simulated` and options, by name."""
     episode_steps: int = 1000
+    at_once: int = AT_ONCE
+    """Contacts that are solved at once; see `mujoco_contacts.solve`."""
 
 
 def _ant(
@@ -95,9 +55,8 @@ def _ant(
     include_cfrc_ext_in_observation: bool = True,
 ) -> Parts:
     def look(data: Any, stepped: bool) -> Any:
-        """Place of the main body, and forces on the bodies, which a reset of Gymnasium leaves at 0."""
-        found: Any = mjx.rne_postconstraint(model.mx, data) if stepped else None
-        forces = found._impl.cfrc_ext if stepped else jnp.zeros((model.c.nbody, 6))
+        """Place of the main body, and forces on the bodies."""
+        forces = body_forces(model, data, stepped)
         return data.xpos[main_body, :2], jnp.clip(forces, *contact_force_range)
 
     def observe(state: GymState) -> Any:
@@ -115,7 +74,7 @@ def _ant(
         costs = ctrl_cost_weight * jnp.sum(action**2) + contact_cost_weight * jnp.sum(forces**2)
         return reward - costs, ~healthy & terminate_when_unhealthy
 
-    return Parts(_noisy(model, reset_noise_scale, normal=True), observe, outcome, look)
+    return Parts(noisy(model, reset_noise_scale, normal=True), observe, outcome, look)
 
 
 def _half_cheetah(
@@ -126,7 +85,7 @@ def _half_cheetah(
     reset_noise_scale: float = 0.1,
     exclude_current_positions_from_observation: bool = True,
 ) -> Parts:
-    start = _noisy(model, reset_noise_scale, normal=True)
+    start = noisy(model, reset_noise_scale, normal=True)
     hidden = 1 if exclude_current_positions_from_observation else 0
     return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight)
 
@@ -139,7 +98,7 @@ def _swimmer(
     reset_noise_scale: float = 0.1,
     exclude_current_positions_from_observation: bool = True,
 ) -> Parts:
-    start = _noisy(model, reset_noise_scale)
+    start = noisy(model, reset_noise_scale)
     hidden = 2 if exclude_current_positions_from_observation else 0
     return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight)
 
@@ -159,10 +118,10 @@ def _hopper(
 ) -> Parts:
     def healthy(qpos: Any, qvel: Any) -> Any:
         others = jnp.concatenate([qpos[2:], qvel])
-        upright = _inside(qpos[1], healthy_z_range) & _inside(qpos[2], healthy_angle_range)
-        return upright & _inside(others, healthy_state_range).all()
+        upright = inside(qpos[1], healthy_z_range) & inside(qpos[2], healthy_angle_range)
+        return upright & inside(others, healthy_state_range).all()
 
-    start = _noisy(model, reset_noise_scale)
+    start = noisy(model, reset_noise_scale)
     hidden = 1 if exclude_current_positions_from_observation else 0
     health = _Health(healthy, healthy_reward, terminate_when_unhealthy)
     return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight, health, 10.0)
@@ -181,9 +140,9 @@ def _walker2d(
     exclude_current_positions_from_observation: bool = True,
 ) -> Parts:
     def healthy(qpos: Any, qvel: Any) -> Any:
-        return _inside(qpos[1], healthy_z_range) & _inside(qpos[2], healthy_angle_range)
+        return inside(qpos[1], healthy_z_range) & inside(qpos[2], healthy_angle_range)
 
-    start = _noisy(model, reset_noise_scale)
+    start = noisy(model, reset_noise_scale)
     hidden = 1 if exclude_current_positions_from_observation else 0
     health = _Health(healthy, healthy_reward, terminate_when_unhealthy)
     return _runner(model, start, hidden, forward_reward_weight, ctrl_cost_weight, health, 10.0)
@@ -194,8 +153,8 @@ def _reacher(model: Simulated, *, reward_dist_weight: float = 1.0, reward_contro
 
     def start(key: Any) -> tuple[Any, Any]:
         """The goal is anywhere in a disc of radius 0.2, where Gymnasium draws in a square until it is in the disc."""
-        noise_Q, noise_V = 2.0 * _uniforms(key, 0, 4) - 1.0, 2.0 * _uniforms(key, 4, 2) - 1.0
-        share, turn = _uniforms(key, 6, 2)
+        noise_Q, noise_V = 2.0 * uniforms_at(key, 0, 4) - 1.0, 2.0 * uniforms_at(key, 4, 2) - 1.0
+        share, turn = uniforms_at(key, 6, 2)
         angle = 2.0 * jnp.pi * turn
         goal = 0.2 * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         qpos = jnp.concatenate([model.mx.qpos0[:2] + 0.1 * noise_Q[:2], goal])
@@ -229,9 +188,9 @@ def _pusher(
         """The object is the first of so many in a rectangle that is far enough from the goal, as with Gymnasium, which
         tries until it is: all are too near in one of 1e10 episodes."""
         tries = 24
-        at = _uniforms(key, model.c.nv, 2 * tries).reshape(tries, 2) * jnp.array([0.3, 0.4]) - jnp.array([0.3, 0.2])
+        at = uniforms_at(key, model.c.nv, 2 * tries).reshape(tries, 2) * jnp.array([0.3, 0.4]) - jnp.array([0.3, 0.2])
         place = at[jnp.argmax(jnp.sum(at**2, axis=1) > 0.17**2)]
-        qvel = 0.005 * (2.0 * _uniforms(key, 0, model.c.nv) - 1.0)
+        qvel = 0.005 * (2.0 * uniforms_at(key, 0, model.c.nv) - 1.0)
         return jnp.concatenate([model.mx.qpos0[:-4], place, jnp.zeros(2)]), qvel.at[-4:].set(0.0)
 
     def observe(state: GymState) -> Any:
@@ -255,7 +214,7 @@ def _inverted_pendulum(model: Simulated, *, reset_noise_scale: float = 0.01) -> 
         done = ~jnp.isfinite(observation).all() | (jnp.abs(observation[1]) > 0.2)
         return jnp.where(done, 0.0, 1.0), done
 
-    return Parts(_noisy(model, reset_noise_scale), observe, outcome)
+    return Parts(noisy(model, reset_noise_scale), observe, outcome)
 
 
 def _inverted_double_pendulum(
@@ -276,7 +235,7 @@ def _inverted_double_pendulum(
         penalties = 0.01 * x**2 + (y - 2.0) ** 2 + 1e-3 * first**2 + 5e-3 * second**2
         return jnp.where(done, 0.0, healthy_reward) - penalties, done
 
-    return Parts(_noisy(model, reset_noise_scale, normal=True), observe, outcome, look)
+    return Parts(noisy(model, reset_noise_scale, normal=True), observe, outcome, look, solves_reset=True)
 
 
 class _Health(NamedTuple):
@@ -320,51 +279,17 @@ def _runner(
     return Parts(start, observe, outcome)
 
 
-def _noisy(model: Simulated, scale: float, *, normal: bool = False) -> Callable[[Any], tuple[Any, Any]]:
-    """Resets near the model's own state: uniform noise on positions, uniform or normal noise on velocities."""
-    nq, nv = model.c.nq, model.c.nv
-
-    def start(key: Any) -> tuple[Any, Any]:
-        if normal:
-            noise_V = normal_integers(jnp, key, _counters(nq, nv)).astype(jnp.float32) / NORMAL_STD
-        else:
-            noise_V = 2.0 * _uniforms(key, nq, nv) - 1.0
-        return model.mx.qpos0 + scale * (2.0 * _uniforms(key, 0, nq) - 1.0), scale * noise_V
-
-    return start
-
-
-def _counters(first: int, count: int) -> Any:
-    return jnp.arange(first, first + count, dtype=jnp.uint32)
-
-
-def _uniforms(key: Any, first: int, count: int) -> Any:
-    """Uniform variates in [0, 1) at coordinates from `first` on."""
-    return uniforms(key, _counters(first, count))
-
-
-def _inside(x: Any, bounds: Range) -> Any:
-    low, high = bounds
-    return (low < x) & (x < high)
-
-
 TASKS = {
     "Ant-v5": GymTask("ant.xml", 5, _ant),
     "HalfCheetah-v5": GymTask("half_cheetah.xml", 5, _half_cheetah),
     "Hopper-v5": GymTask("hopper.xml", 4, _hopper),
     "Walker2d-v5": GymTask("walker2d_v5.xml", 4, _walker2d),
     "Swimmer-v5": GymTask("swimmer.xml", 4, _swimmer),
+    "Humanoid-v5": GymTask("humanoid.xml", 5, humanoid),
+    "HumanoidStandup-v5": GymTask("humanoidstandup.xml", 5, humanoid_standup, at_once=8),
     "Reacher-v5": GymTask("reacher.xml", 2, _reacher, 50),
     "Pusher-v5": GymTask("pusher_v5.xml", 5, _pusher, 100),
     "InvertedPendulum-v5": GymTask("inverted_pendulum.xml", 2, _inverted_pendulum),
     "InvertedDoublePendulum-v5": GymTask("inverted_double_pendulum.xml", 5, _inverted_double_pendulum),
 }
 """Environments by their IDs in Gymnasium."""
-_HUMANOID = (
-    "MJX has 138 places for its contacts, and a reset and a step are more operations than simd compiles, 2,000,000"
-)
-REFUSED = {
-    "Humanoid-v5": _HUMANOID,
-    "HumanoidStandup-v5": _HUMANOID,
-}
-"""Environments of Gymnasium's MuJoCo that are none here -> the reason."""

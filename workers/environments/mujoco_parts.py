@@ -213,22 +213,37 @@ def _turning(model: mjx.Model, moved: Any, qvel: Any) -> Any:
 
 
 def forward(
-    model: mjx.Model, state: MujocoState, ctrl: Any, contacts: Mapping[Any, Any] = MappingProxyType({})
+    model: mjx.Model,
+    state: MujocoState,
+    ctrl: Any,
+    contacts: Mapping[Any, Any] = MappingProxyType({}),
+    *,
+    solved: bool = True,
 ) -> mjx.Data:
     """What a state and controls [nu] imply, as `mujoco.mj_forward`: positions of bodies, contacts, forces, sensors.
 
     Args:
         contacts: as of `step_and_look`.
+        solved: whether to solve the constraints, which is most of the code. Data that are not solved have None in place
+            of the accelerations `qacc` and of the constraints' forces `qfrc_constraint`.
     """
     with contacts_as_c(contacts):
-        return _forward(model, _data(mjx.make_data(model), state, ctrl), AT_ONCE)
+        data = _data(mjx.make_data(model), state, ctrl)
+        if solved:
+            return _forward(model, data, AT_ONCE)
+        return _unsolved(model, data).replace(qacc=None, qfrc_constraint=None)
+
+
+def _unsolved(model: mjx.Model, data: Any) -> Any:
+    """`mjx.forward` until it solves the constraints."""
+    data = sensor.sensor_pos(model, forward_of_mjx.fwd_position(model, data))
+    data = sensor.sensor_vel(model, forward_of_mjx.fwd_velocity(model, data))
+    return forward_of_mjx.fwd_acceleration(model, forward_of_mjx.fwd_actuation(model, data))
 
 
 def _forward(model: mjx.Model, data: Any, at_once: int) -> Any:
     """`mjx.forward` with the constraints solved by `mujoco_contacts.solve`, whose argument `at_once` is."""
-    data = sensor.sensor_pos(model, forward_of_mjx.fwd_position(model, data))
-    data = sensor.sensor_vel(model, forward_of_mjx.fwd_velocity(model, data))
-    data = forward_of_mjx.fwd_acceleration(model, forward_of_mjx.fwd_actuation(model, data))
+    data = _unsolved(model, data)
     if not data._impl.efc_J.size:
         return data.replace(qacc=data.qacc_smooth)
     return sensor.sensor_acc(model, solve(model, data, at_once))

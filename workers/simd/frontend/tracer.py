@@ -83,7 +83,7 @@ Nodes = NDArray[np.int64]
 """Node numbers, in the shape of the array that they represent."""
 PrimitiveRule = Callable[..., Any]
 """Rule of a primitive for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of arrays."""
-GRAPH_LIMIT = 2_000_000
+GRAPH_LIMIT = 3_000_000
 """Most nodes of a graph; a greater one would take too long to compile."""
 PRIMITIVES: dict[str, PrimitiveRule] = {}
 """Rules by the name of JAX's primitive."""
