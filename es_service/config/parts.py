@@ -2,7 +2,7 @@
 
 A part is chosen by its `kind`, which is a class here whose other fields are its keys: the step, the shaping, the noise,
 the elites, and what members are ranked by (objectives). Each kind has a function in `search/steps.py`,
-`search/shaping.py`, `search/objectives.py` or `search/maps/`.
+`search/shaping.py` or `search/maps/`.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def settings_words(settings: Mapping[str, Any]) -> str:
 def _meaning_of_null(key: str) -> str:
     """What the description of a key says of null; "none" if it says nothing short."""
     field = FIELDS.get(key) or all_search_fields(ALGORITHMS).get(key)
-    found = re.search(r"\bnull: ([^.,;]{1,40})[.,;]", (field and field.description) or "")
+    found = re.search(r"\bnull`?: ([^.,;]{1,40})[.,;]", (field and field.description) or "")
     return found[1] if found else "none"
 
 

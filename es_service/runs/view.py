@@ -261,7 +261,7 @@ class Run:
         return reader.read_generation(self.folder)
 
     def _repr_html_(self) -> str | None:
-        """What a notebook shows: summary, curves and map; `report/notebook.py` draws it, which is above this room."""
+        """What a notebook shows: summary, curves and map; `report/write.py` draws it, which is above this room."""
         return None if draw_for_notebook is None else draw_for_notebook(self)
 
     def digest(self) -> str:

@@ -34,9 +34,9 @@ def without_linux(*command: str, **options) -> subprocess.Popen:
 
 SAME = """
 import os, time
-from es_service.protocol import system
+from es_service.protocol import machine
 from es_service.store.folder import is_network_filesystem
-print(system.usable_cpus(), *system.memory_bytes(), system.process_start_s(), is_network_filesystem(os.getcwd()))
+print(machine.usable_cpus(), *machine.memory_bytes(), machine.process_start_s(), is_network_filesystem(os.getcwd()))
 """
 
 

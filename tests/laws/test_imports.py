@@ -131,7 +131,7 @@ def test_imports_go_down(path):
         ("es_service.store.lock", "from es_service.cli.common import command", "cli is above store"),
         ("es_service.loop.driver", "from es_service.store import writer", "store is above loop"),
         ("es_service.config.model", "import es_service.search.novelty", "search is above config"),
-        ("es_service.search.novelty", "def f():\n    from es_service.loop import clock", "loop is above search"),
+        ("es_service.search.novelty", "def f():\n    from es_service.loop import budget", "loop is above search"),
         ("es_service.protocol.wire", "from es_service.errors import StoreError", "protocol imports nothing"),
         ("es_service.__main__", "from workers import worker", "import workers"),
         ("es_service.api", "import workers", "import workers"),
