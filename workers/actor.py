@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from es_service.protocol.machine import platform_info, platform_text
+from es_service.protocol.machine import cpu_seconds, platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
 from es_service.protocol.sent import LackingError, Received
@@ -108,7 +108,8 @@ class WorkerActor:
             return self._run_chunks.seconds_to_compile(self._unpacked(item, arrays))
 
     def run(self, item: bytes, *arrays: bytes) -> bytes:
-        """Run chunks; returns the pickled (results, its report or None), or None if it lacks arrays.
+        """Run chunks; returns the pickled (results, its report or None, seconds of processors that its process has
+        used), or None if it lacks arrays.
 
         Args:
             item: pickled (arrays by name, origins, work) of a `Parcel`.
@@ -123,7 +124,7 @@ class WorkerActor:
             except LackingError:
                 return pickle.dumps(None)
             self._reports.note(results := self._run_chunks(work))
-            return pickle.dumps((results, self._reports.report()), pickle.HIGHEST_PROTOCOL)
+            return pickle.dumps((results, self._reports.report(), cpu_seconds(())), pickle.HIGHEST_PROTOCOL)
 
     def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""

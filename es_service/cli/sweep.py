@@ -39,11 +39,11 @@ from es_service.cli.common import (
     print_note,
 )
 from es_service.config.given import parse_overrides
-from es_service.config.text import split_values
+from es_service.config.text import split_values, unknown_name
 from es_service.errors import ConfigError, Interrupted, Problem, counted
 from es_service.protocol.machine import given_path
 from es_service.report.progress import ShowNotice, print_notice, short
-from es_service.runs.sweep import Certifying, OnProgress, SweptRun, run_planned
+from es_service.runs.sweep import COSTS, Certifying, OnProgress, SweptRun, run_planned
 from es_service.runs.sweep_plan import Labelled, left_out_notes, plan
 from es_service.runs.tracking import check_trackers
 
@@ -85,9 +85,12 @@ def sweep(
     parallel: ParallelOption = None,
     certify: Annotated[bool, typer.Option("--certify", help="Certify each run at its end, as evaluate does.")] = False,
     certify_at: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            "--certify-at", metavar="STEPS,...", help="Certify runs at these environment steps, too, and at the end."
+            "--certify-at",
+            metavar="[COST=]N,...",
+            help="Certify runs at these costs, too, and at the end: environment steps, or rollout_s= or cpu_s= and "
+            "seconds.",
         ),
     ] = None,
     workers: Annotated[
@@ -103,7 +106,7 @@ def sweep(
     if not grid and seeds is None and len(configs) < 2:
         raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both, or several configs")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    certifying = Certifying(steps_of(certify_at or "")) if certify or certify_at else None
+    certifying = Certifying(points_of(certify_at or ())) if certify or certify_at else None
     options, named = _options_of_each(log, log_level), labelled(configs, label or ())
     run_sweep(named, out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying, as_json=as_json)
 
@@ -227,18 +230,23 @@ def seeds_of(text: str) -> list[int]:
     return seeds
 
 
-def steps_of(text: str) -> list[float]:
-    """Numbers of environment steps from text such as 1e7,1e8."""
-    steps = []
-    for part in filter(None, text.split(",")):
-        try:
-            steps.append(float(part))
-        except ValueError:
-            steps.append(0.0)
-        if not 1 <= steps[-1] < math.inf:
-            what = f"--certify-at {text}: {part} is no number of environment steps; write numbers such as 1e7,1e8"
-            raise ConfigError(what, field="certify_at", value=text)
-    return steps
+def points_of(words: Sequence[str]) -> dict[str, list[float]]:
+    """Values by cost from words such as 1e7,1e8 (environment steps) and cpu_s=60,120. Raises ConfigError."""
+    points: dict[str, list[float]] = {}
+    for word in words:
+        cost, equals, text = word.rpartition("=")
+        if equals and cost not in COSTS:
+            raise unknown_name("cost", cost, COSTS, "certify_at")
+        for part in text.split(","):
+            try:
+                value = float(part)
+            except ValueError:
+                value = math.nan
+            if not 0 < value < math.inf:
+                what = f"--certify-at {word}: {part!r} is no cost; write numbers above 0, such as 1e7,1e8 or cpu_s=60"
+                raise ConfigError(what, field="certify_at", value=word)
+            points.setdefault(cost or "env_steps", []).append(value)
+    return points
 
 
 def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:

@@ -90,9 +90,6 @@ def choices_are_for_objects(config: Values, task: TaskSpec) -> Problems:
 
 
 def times_are_measured(config: Values, task: TaskSpec) -> Problems:
-    if (limit := config["budget.cpu_s"]) is not None and config["compute.engine"] == "ray":
-        why = " with engine ray, whose workers may be on other machines"
-        yield not_allowed("budget.cpu_s", limit, "null", why=why, hint="; budget.rollout_s is measured everywhere")
     for key in ("budget.rollout_s", "budget.cpu_s"):
         if (limit := config[key]) is not None and task.kind == CALLER:
             yield not_allowed(key, limit, "null", why=f" for {task.name}, whose episodes the caller computes")

@@ -213,7 +213,8 @@ class BudgetConfig(Section):
         None,
         description="Seconds of the processors of the driver and of all its workers, starting and compiling "
         "included, summed over all sessions. The generation that reaches it is the last; the end says by how much it "
-        "was exceeded. With engine `inline` only.",
+        "was exceeded. Of an actor of Ray that was lost, it counts what it had used by its last answer; Ray's own "
+        "processes do not count.",
     )
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
     target_certified: Number | None = Field(

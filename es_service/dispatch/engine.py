@@ -11,7 +11,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
@@ -33,7 +33,6 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.child import require_same_process
 from es_service.protocol.episodes import DispatchCounts, pieces_of, together
-from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 from es_service.protocol.policies import POLICY_SLOTS
 
@@ -101,9 +100,9 @@ class Transport(Protocol):
         """
         ...
 
-    def process_ids(self) -> Mapping[int, int] | None:
-        """Worker id -> process id, for the workers that are not known to be lost; None if they may be on other
-        machines."""
+    def cpu_s(self) -> float:
+        """Seconds of the processors of this process and of its workers so far, also of those that have ended; NaN if
+        they are not measured."""
         ...
 
     def platforms(self) -> frozenset[str]:
@@ -183,7 +182,7 @@ class Engine(Generic[AnyTransport]):
         self._state = initial_state(limits)
         self._phase = 0
         self._computing = Computing()
-        self._cpu_before_s, self._cpu_known = cpu_seconds(()), (-math.inf, 0.0)
+        self._cpu_before_s, self._cpu_known = transport.cpu_s(), (-math.inf, 0.0)
         self.describe: Callable[[Sequence[Work]], str] = lambda work: ""
         """What an error says of a work item whose workers were lost, since these could not name it; a sentence
         without a full stop, or nothing."""
@@ -219,11 +218,8 @@ class Engine(Generic[AnyTransport]):
 
     def _cpu_s(self) -> float:
         """Seconds of processors so far, looked up at most every CPU_S seconds."""
-        processes, now = self.transport.process_ids(), time.monotonic()
-        if processes is None:
-            return math.nan
-        if now >= self._cpu_known[0] + CPU_S:
-            self._cpu_known = now, cpu_seconds(set(processes.values())) - self._cpu_before_s
+        if (now := time.monotonic()) >= self._cpu_known[0] + CPU_S:
+            self._cpu_known = now, self.transport.cpu_s() - self._cpu_before_s
         return self._cpu_known[1]
 
     def wait_for_place(self) -> None:

@@ -34,7 +34,7 @@ from es_service.dispatch.events import (
 from es_service.dispatch.staying import staying
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.content import Cache
-from es_service.protocol.machine import places
+from es_service.protocol.machine import cpu_seconds, places
 from es_service.protocol.messages import FloatArray, Report, Work, WorkerSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.sent import LACKS_AGAIN, SENDER_BYTES, Memory, parcel
@@ -119,6 +119,10 @@ class ChildProcesses:
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
         return {number: worker.child.pid for number, worker in self._workers.items()}
+
+    def cpu_s(self) -> float:
+        """Seconds of the processors of this process and of all its children, with those that wait for the next run."""
+        return cpu_seconds({*self.process_ids().values(), *staying().process_ids()})
 
     def start(self, worker: int) -> None:
         """Start a child and send it the constants of the run; or have the existing child start another thread."""

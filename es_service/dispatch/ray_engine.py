@@ -45,7 +45,7 @@ from es_service.dispatch.ray_calls import (
 )
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
-from es_service.protocol.machine import cores
+from es_service.protocol.machine import cores, cpu_seconds
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
 from es_service.protocol.sent import LACKS_AGAIN, Memory
 from es_service.protocol.sources import OtherCodeError
@@ -170,6 +170,8 @@ class Actors:
         """Worker, work item and attempt for which the worker has lacked arrays once."""
         self._refusals = Refusals(on_refusal)
         self._on_report = on_report
+        self._cpu_s: dict[int, float] = {}
+        """Worker id -> seconds of processors that it has used by its newest answer, also of those that were lost."""
         self._gone: dict[int, WorkerPlace] = {}
         """Places of the workers that were lost last."""
 
@@ -238,9 +240,10 @@ class Actors:
             return
         self._calls[ref] = Call(worker, "run", item_id, attempt, work)
 
-    def process_ids(self) -> None:
-        """None, since they may be on other machines."""
-        return
+    def cpu_s(self) -> float:
+        """Seconds of the processors of this process, and of each actor by its newest answer; without those of Ray's own
+        processes."""
+        return cpu_seconds(()) + sum(self._cpu_s.values())
 
     def platforms(self) -> frozenset[str]:
         """`machine.platform_text` of each kind of actor that has come up."""
@@ -323,7 +326,7 @@ class Actors:
                 self.send(*item, call.work)
                 return None
             self._lacking.discard(item)
-            results, report = value
+            results, report, self._cpu_s[call.worker] = value
             if report is not None:
                 self._reported(call.worker, report)
             return Answer(call.worker, call.item_id, call.attempt, results)
@@ -415,7 +418,7 @@ def _read(what: str, value: Any) -> Any:
     match what:
         case "run":
             answer = pickle.loads(value)
-            return None if answer is None else (list(answer[0]), answer[1])
+            return None if answer is None else (list(answer[0]), answer[1], float(answer[2]))
         case "place":
             return WorkerPlace(*value)
         case "compile":

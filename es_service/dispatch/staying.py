@@ -45,6 +45,11 @@ class Staying:
             ended = [self._idle.pop(0) for _ in range(len(self._idle) - most)]
         _end(ended)
 
+    def process_ids(self) -> list[int]:
+        """Ids of those that wait."""
+        with self._turn:
+            return [child.pid for _, child in self._idle]
+
     def enter(self) -> None:
         """A block of `workers` begins."""
         with self._turn:

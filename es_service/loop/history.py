@@ -122,7 +122,7 @@ _SEARCH_AND_TIMES = (
 )
 _COSTS = (
     Column("rollout_s", "REAL", False, "seconds in which workers computed so far, as budget.rollout_s counts them"),
-    Column("cpu_s", "REAL", False, "seconds of all processors so far, as budget.cpu_s counts them; none with Ray"),
+    Column("cpu_s", "REAL", False, "seconds of all processors so far, as budget.cpu_s counts them"),
 )
 LATER = frozenset(column.name for column in _COSTS)
 """Columns that runs of versions before 0.27 lack, and that are not stored where they are continued."""

@@ -19,8 +19,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+
 from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
+from es_service.config.text import unknown_name
 from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, only_started, spent
@@ -37,29 +40,41 @@ from es_service.runs.sweep_plan import Labelled, PlannedRun, ValuesOfKeys, plan
 from es_service.runs.worker_count import shared
 from es_service.store.folder import explained, holds_run
 from es_service.store.lock import acquire_lock
-from es_service.store.reader import read_newest
+from es_service.store.reader import read_history_columns, read_newest
 
 # The commands of a run of a sweep, one after another: run it, certify it at some points of cost, and at its end.
+
+
+COSTS = ("env_steps", "rollout_s", "cpu_s")
+"""What a run may cost until it is certified: keys of the budget, which are columns of the history, too."""
 
 
 @dataclass(frozen=True)
 class Certifying:
     """When the runs of a sweep are certified: at their ends, and at some points of cost."""
 
-    at: Sequence[float] = ()
-    """Environment steps of these points."""
+    at: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """One of COSTS -> values at which runs are certified, too."""
 
-    def next_point(self, planned: PlannedRun, row: Row | None, *, ended: bool) -> float | None:
-        """Environment steps until which a run goes on before it is certified; infinite for its end. None: all of its
+    def next_limits(self, planned: PlannedRun, row: Row | None, *, ended: bool) -> dict[str, float] | None:
+        """Limits until which a run goes on before it is certified, by keys of COSTS; none for its end. None: all of its
         certifications are there.
 
         Args:
             ended: whether its budget is spent.
         """
-        done = _certified_steps(planned.folder)
-        limit, steps = planned.config.budget.env_steps or math.inf, -1 if row is None else row["env_steps"]
-        points = [] if ended else [at for at in sorted(self.at) if at < limit and not any(was >= at for was in done)]
-        return points[0] if points else None if ended and steps in done else math.inf
+        done = _certified_costs(planned.folder)
+        if ended:
+            return None if row is not None and row["env_steps"] in done["env_steps"] else {}
+        left = {
+            key: [
+                at
+                for at in values
+                if at < (getattr(planned.config.budget, key) or math.inf) and not any(was >= at for was in done[key])
+            ]
+            for key, values in self.at.items()
+        }
+        return {key: min(values) for key, values in left.items() if values}
 
 
 @dataclass
@@ -81,12 +96,12 @@ class RunCommands:
         state, _ = end(self.planned.folder, self.planned.config, row)
         if self.certifying is None or state == "stopped":
             return self.run if state == "waiting" else []
-        point = self.certifying.next_point(self.planned, row, ended=state == "finished")
-        if point is None:
+        limits = self.certifying.next_limits(self.planned, row, ended=state == "finished")
+        if limits is None:
             return []
-        if state == "finished" or (row is not None and row["env_steps"] >= point):
+        if state == "finished" or (row is not None and any(row[key] >= at for key, at in limits.items())):
             return self.certify
-        return self.run if point == math.inf else [*self.run, "--set", f"budget.env_steps={math.ceil(point)}"]
+        return [*self.run, *(f"--set=budget.{key}={_written(key, at)}" for key, at in limits.items())]
 
 
 def command_of(
@@ -111,12 +126,22 @@ def command_of(
     )
 
 
-def _certified_steps(folder: Path) -> list[int]:
-    """Environment steps at which a run has been certified; none if this cannot be read, which its own process tells."""
+def _written(key: str, at: float) -> int | float:
+    """A limit as a value of a config, in which environment steps are whole."""
+    return math.ceil(at) if key == "env_steps" else at
+
+
+def _certified_costs(folder: Path) -> dict[str, list[float]]:
+    """One of COSTS -> what a run had cost when it was certified, each time; nothing if this cannot be read, which its
+    own process tells."""
+    done: dict[str, list[float]] = {key: [] for key in COSTS}
     with suppress(StoreError):
-        if holds_run(folder):
-            return [row["env_steps"] for row in certified_over_time(folder) if row["env_steps"] is not None]
-    return []
+        steps = [row["env_steps"] for row in certified_over_time(folder)] if holds_run(folder) else []
+        if steps := [at for at in steps if at is not None]:
+            history = read_history_columns(folder)
+            is_certified_G = np.isin(history["env_steps"], steps)
+            done |= {key: np.asarray(history[key], float)[is_certified_G].tolist() for key in COSTS if key in history}
+    return done
 
 
 def end(folder: Path, config: RunConfig, row: Row | None) -> tuple[Literal["waiting", "finished", "stopped"], str]:
@@ -179,7 +204,7 @@ def sweep(
     overrides: Overrides = (),
     parallel: int | None = None,
     certify: bool = False,
-    certify_at: Iterable[float] = (),
+    certify_at: Iterable[float] | Mapping[str, Iterable[float]] = (),
     on_progress: OnProgress = lambda runs: None,
 ) -> list[SweptRun]:
     """Run a config with every combination of some settings and every seed; each run has a folder in `out`.
@@ -198,7 +223,8 @@ def sweep(
             `compute.workers` is a number; None: as many as there are cores, or one if they use GPUs.
         certify: whether each run is certified at its end, by `certify_run`.
         certify_at: numbers of environment steps at which runs are certified, too: after the generation that reaches
-            them. Given any, runs are also certified at their ends.
+            them. Or a mapping from "env_steps", "rollout_s" or "cpu_s", as a budget has them, to such numbers. Given
+            any, runs are also certified at their ends.
 
     Returns:
         The runs, for example for `write_comparison`: each "finished", "failed", or "stopped" since starting took all of
@@ -210,7 +236,10 @@ def sweep(
             reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
     """
     folder = given_path(out)
-    points = tuple(certify_at)
+    given = certify_at if isinstance(certify_at, Mapping) else {"env_steps": certify_at}
+    if unknown := [key for key in given if key not in COSTS]:
+        raise unknown_name("cost", unknown[0], COSTS, "certify_at")
+    points = {key: values for key, of in given.items() if (values := tuple(of))}
     certifying = Certifying(points) if certify or points else None
     return run_planned(
         plan(config, folder, grid, seeds, overrides), folder, parallel, on_progress, certifying=certifying
@@ -371,7 +400,7 @@ def _at_first(planned: PlannedRun, certifying: Certifying | None) -> SweptRun:
     is certified where it is to be."""
     row = newest(planned.folder)
     state, reason = end(planned.folder, planned.config, row)
-    if state == "finished" and certifying and certifying.next_point(planned, row, ended=True) is not None:
+    if state == "finished" and certifying and certifying.next_limits(planned, row, ended=True) is not None:
         state, reason = "waiting", ""
     return SweptRun(planned.name, planned.folder, limits_of(planned.config.budget), state, row, reason)
 

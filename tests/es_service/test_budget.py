@@ -12,7 +12,6 @@ from es_service.cli.main import app
 from es_service.dispatch.events import Compiled, Limits, Result, Submit, WorkerLost
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.dispatch.waits import Computing
-from es_service.errors import ConfigError
 from es_service.loop import budget, driver
 from es_service.loop.budget import durations, only_started, spent
 from es_service.loop.history import LATER
@@ -111,11 +110,6 @@ def test_a_run_without_the_columns_of_later_versions_goes_on_without_them(tmp_pa
         names = {column.name for column in meta.columns}
         store.commit(0, {}, dict.fromkeys(names - {"generation"}))
         assert "rollout_s" not in store.last_history()
-
-
-def test_processors_of_other_machines_are_not_measured():
-    with pytest.raises(ConfigError, match=r"budget.cpu_s: 5.* with engine ray"):
-        api.load_config(CONFIG, ["budget.cpu_s=5", "compute.engine=ray"])
 
 
 def test_a_run_with_time_for_nothing_but_its_start_has_only_started():

@@ -62,7 +62,7 @@ class Scripted:
         self.last_words: dict[int, str] = {}
         self.waits: list[float] = []
         self.compiled: set[tuple[int, str]] = set()
-        self.closed = False
+        self.closed, self.used_s = False, math.nan
         self.on_send: Callable[[Sent], Any] = lambda sent: self.inbox.append(sent.answer())
         self.on_wait: Callable[[], Any] = lambda: None
 
@@ -83,8 +83,8 @@ class Scripted:
             self.inbox.append(Compiled(worker, item_id.kind, 0.0))
         self.on_send(self.sent[-1])
 
-    def process_ids(self) -> None:
-        return None
+    def cpu_s(self) -> float:
+        return self.used_s
 
     def shortage(self) -> str:
         return ""
@@ -109,6 +109,15 @@ def scripted_with_clock(monkeypatch, now: list[float]) -> Scripted:
     transport.on_wait = lambda: now.__setitem__(0, now[0] + transport.waits[-1])
     monkeypatch.setattr(engine_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     return transport
+
+
+def test_seconds_of_processors_before_an_engine_are_not_its_own():
+    """Such as those that workers which stay have computed for other runs."""
+    transport = Scripted()
+    transport.used_s = 5.0
+    with Engine(transport, Limits(workers=1)) as engine:
+        transport.used_s = 7.5
+        assert engine.counts.cpu_s == 2.5
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from es_service.protocol.system import cpu_seconds
 
 from es_service.dispatch import ray_calls, waits
 from es_service.dispatch import ray_engine as ray_engine_module
@@ -168,7 +169,9 @@ class PretendedRay:
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
             "compile": compile,
-            "run": lambda *item: pickle.dumps(([f"of {chunk}" for _, chunk in work(*item)], actor.report)),
+            "run": lambda *item: pickle.dumps(
+                ([f"of {chunk}" for _, chunk in work(*item)], actor.report, 10.0 * (1 + actor.ran))
+            ),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
         looked = SimpleNamespace(
@@ -243,6 +246,18 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
         ray.on_run = node_dies
         assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
+
+
+def test_seconds_of_processors_are_those_of_the_driver_and_of_all_actors_lost_ones_too():
+    ray = PretendedRay()
+    with ray_engine(ray, Limits(2)) as engine:
+        while not all(actor.ran for actor in ray.actors):
+            engine.evaluate(with_subject(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+        ray.end(ray.actors[0])
+        engine.evaluate(with_subject(FIRST, [CHUNK]))
+        used = 10.0 * sum(actor.ran for actor in ray.actors)
+        assert ray.actors[0].ran > 0
+        assert engine.transport.cpu_s() - cpu_seconds(()) == pytest.approx(used, abs=1.0)
 
 
 def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():

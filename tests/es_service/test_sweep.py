@@ -5,7 +5,6 @@ Sweeps themselves are in `tests/system/test_sweep.py`.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli.main import app
-from es_service.cli.sweep import grid_of, live_table, seeds_of, steps_of
+from es_service.cli.sweep import grid_of, live_table, points_of, seeds_of
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
@@ -164,11 +163,18 @@ def test_other_seeds_are_refused(text):
     assert error.value.suggestion == {"5:0": "0:6", "5:5": "5:6"}.get(text)
 
 
-def test_points_of_cost_are_environment_steps():
-    assert steps_of("1e7, 100000000") == [1e7, 1e8]
-    for text in ("x", "0", "nan", "inf", "1e7,-1"):
-        with pytest.raises(ConfigError, match="is no number of environment steps"):
-            steps_of(text)
+def test_points_of_cost_are_environment_steps_or_seconds():
+    assert points_of(["1e7, 100000000", "cpu_s=60,120", "cpu_s=7.5"]) == {
+        "env_steps": [1e7, 1e8],
+        "cpu_s": [60.0, 120.0, 7.5],
+    }
+    for text in ("x", "0", "nan", "inf", "1e7,-1", "rollout_s=", ""):
+        with pytest.raises(ConfigError, match="is no cost; write numbers above 0"):
+            points_of([text])
+    with pytest.raises(ConfigError, match=r"the cost cpu is unknown; must be .*did you mean cpu_s"):
+        points_of(["cpu=60"])
+    with pytest.raises(ConfigError, match="the cost seconds is unknown"):
+        sweep(MINIMAL, "nowhere", seeds=[0], certify_at={"seconds": [1.0]})
 
 
 def test_values_of_the_grid_are_those_of_set(tmp_path):
@@ -211,18 +217,23 @@ def test_options_that_contradict_each_other_are_refused(tmp_path):
 
 
 def test_a_run_is_certified_at_points_of_cost_and_at_its_end(tmp_path, monkeypatch):
-    """The points are given as environment steps; a generation of these runs has 1,000, and the budget is 20,000."""
+    """A generation of these runs has 1,000 environment steps and takes 10 s, and the budget is 20,000 steps."""
     planned = plan(MINIMAL, tmp_path, {}, [0], ["budget.env_steps=20000", "budget.generations=1000"])[0]
     steps, done = [0], []
     monkeypatch.setattr(sweep_commands, "certified_over_time", lambda _: [{"env_steps": value} for value in done])
     monkeypatch.setattr(sweep_commands, "holds_run", lambda _: steps[0] > 0)
     monkeypatch.setattr(sweep_commands, "recent_durations", lambda *_: ())
     monkeypatch.setattr(
-        sweep_commands, "read_newest", lambda _: {"generation": 0, "env_steps": steps[0], "best_fitness": 0.0}
+        sweep_commands,
+        "read_newest",
+        lambda _: {"generation": 0, "env_steps": steps[0], "cpu_s": steps[0] / 100, "best_fitness": 0.0},
     )
+    steps_G = np.arange(0, 21000, 1000)
+    history = {"env_steps": steps_G, "rollout_s": steps_G * np.nan, "cpu_s": steps_G / 100}
+    monkeypatch.setattr(sweep_commands, "read_history_columns", lambda _: history)
     (tmp_path / INSIDE).mkdir()
 
-    def words(*at):
+    def words(**at):
         command = command_of(planned, 2, tmp_path / INSIDE, ["--log=wandb"], Certifying(at))
         return command.next_words()
 
@@ -241,15 +252,24 @@ def test_a_run_is_certified_at_points_of_cost_and_at_its_end(tmp_path, monkeypat
         (20000, [20000], None),
     ):
         steps[0], done[:] = now, known
-        found = words(12000, 7000.5, 30000)
+        found = words(env_steps=[12000, 7000.5, 30000])
         if expected is None:
             assert found == []
         elif expected == "certify":
             assert found[-5:] == certify
         else:
-            assert found[-1] == (expected or run[-1])
+            assert found[-1] == (f"--set={expected}" if expected else run[-1])
             assert "run" in found
-    assert Certifying().next_point(planned, None, ended=False) == math.inf
+    assert Certifying().next_limits(planned, None, ended=False) == {}
+    for now, known, expected in (
+        (0, [], ["--set=budget.env_steps=9000", "--set=budget.cpu_s=55.5"]),
+        (6000, [], certify[-2:]),
+        (6000, [6000], ["--set=budget.env_steps=9000", "--set=budget.cpu_s=120"]),
+        (9000, [6000, 9000], ["--log=wandb", "--set=budget.cpu_s=120"]),
+        (12000, [6000, 12000], run[1:]),
+    ):
+        steps[0], done[:] = now, known
+        assert words(env_steps=[9000], cpu_s=[120, 55.5])[-len(expected) :] == expected
 
 
 def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):

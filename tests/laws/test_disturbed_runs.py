@@ -7,6 +7,7 @@ A new method takes part by its name.
 
 from __future__ import annotations
 
+import math
 import random
 import shutil
 from collections import Counter, defaultdict, deque
@@ -128,8 +129,8 @@ class FaultyWorkers:
         self.running = [one for one in self.running if one[0] != worker]
         return ""
 
-    def process_ids(self) -> None:
-        return None
+    def cpu_s(self) -> float:
+        return math.nan
 
     def platforms(self) -> frozenset[str]:
         return frozenset()
