@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.text import unknown_name
 from es_service.errors import ConfigError
 from es_service.report import statistics
-from es_service.report.bootstrap import LEVEL
 from es_service.report.compare import Group, runs_of
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -28,6 +28,7 @@ from es_service.report.markup import Markup, table, tag
 from es_service.report.measures import Measure, chosen
 from es_service.report.page import section
 from es_service.report.statistics import Difference
+from es_service.runs.selection import LEVEL
 
 FORMATS = (".json", ".csv", ".tex")
 """Kinds of files of statistics."""
@@ -123,7 +124,7 @@ def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[list[ND
     measure, value = known.get(name, (Measure("", "", ""), lambda _: np.nan))
     found = _values(groups, value)
     if any(np.isnan(np.concatenate(of_group)).any() for of_group in found):
-        raise ConfigError(f"{name} is no measure that all runs have", value=name, allowed=", ".join(known))
+        raise unknown_name("measure", name, known, "metrics")
     return measure.label, -1.0 if measure.less_is_better else 1.0, found
 
 
@@ -155,16 +156,13 @@ def _last(column: str) -> Callable[[RunData], float]:
 def _average(group: Group, values_R: list[NDArray[np.float64]]) -> Average:
     is_finite = bool(np.isfinite(np.concatenate(values_R)).all())
 
-    def known(measure: statistics.Measure) -> Ends | None:
-        return statistics.interval(measure, values_R) if group.are_independent else None
-
     return Average(
         group.name,
         len(group.runs),
         float(statistics.median(values_R)),
-        known(statistics.median),
+        statistics.interval_of_median(values_R) if group.are_independent else None,
         float(statistics.iqm(values_R)) if is_finite else None,
-        known(statistics.iqm) if is_finite else None,
+        statistics.interval(statistics.iqm, values_R) if is_finite and group.are_independent else None,
     )
 
 

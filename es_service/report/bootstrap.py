@@ -15,7 +15,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-LEVEL = 0.95
+from es_service.runs.selection import LEVEL
+
 WHOLE_RANGE = 5
 """With at most so many seeds, the interval reaches from the lowest to the highest value."""
 

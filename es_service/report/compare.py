@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from es_service.config.parts import RESOURCES
 from es_service.config.resolution import LEFT_OPEN
-from es_service.config.text import did_you_mean, in_line, nearest
+from es_service.config.text import did_you_mean, in_line, nearest, unknown_name
 from es_service.errors import ConfigError
 from es_service.report import statistics
 from es_service.report.bootstrap import median_interval
@@ -200,12 +200,7 @@ def labelled(runs: Sequence[RunData], keys: Sequence[str], labels: Mapping[str, 
     names = [group.name for group in groups]
     for name in labels:
         if name not in names:
-            raise ConfigError(
-                f"label: there is no group {name}{did_you_mean(name, names)}; the groups are {', '.join(names)}",
-                field="label",
-                value=name,
-                suggestion=nearest(name, names),
-            )
+            raise unknown_name("group", name, names, "label")
     return [replace(run, group=labels.get(group.name, group.name)) for group in groups for run in group.runs]
 
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.text import did_you_mean, nearest
-from es_service.errors import ConfigError
+from es_service.config.text import unknown_name
 from es_service.loop.history import CORRECTED, METRIC
 from es_service.report.series import HistoryColumns
 from es_service.runs.certified import measure_of
@@ -104,13 +103,7 @@ def chosen(runs: Sequence[RunData], names: Sequence[str]) -> dict[str, Measure]:
     found = measures(runs)
     for name in names:
         if name not in found:
-            raise ConfigError(
-                f"{name} is no measure that all runs have{did_you_mean(name, found)}; they have {', '.join(found)}",
-                field="metrics",
-                value=name,
-                allowed=", ".join(found),
-                suggestion=nearest(name, found),
-            )
+            raise unknown_name("measure", name, found, "metrics")
     return {name: found[name] for name in names} or found
 
 

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from es_service.report.bootstrap import LEVEL
+from es_service.report.bootstrap import median_interval
+from es_service.runs.selection import LEVEL
 
 MOST_COUNTED = 20_000
 """Most ways to draw runs, or to share them out between two groups, that are all counted."""
@@ -72,6 +73,14 @@ def interval(measure: Measure, values: Values) -> tuple[float, float] | None:
         return None
     drawn, share_W = _drawn(values)
     return _percentiles(np.asarray(measure(drawn), float), share_W)
+
+
+def interval_of_median(values: Values) -> tuple[float, float] | None:
+    """As `interval` of the median; with one task, all ways to draw its runs are counted, however many there are."""
+    if len(values) > 1 or len(values[0]) < 2:
+        return interval(median, values)
+    low, high = median_interval(values[0][:, None])[:, 0].tolist()
+    return low, high
 
 
 def profile(values: Values, threshold_K: Array) -> Array:
