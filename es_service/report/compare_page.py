@@ -14,7 +14,7 @@ from es_service.report.compare import Group, Quartiles, Summary
 from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
 from es_service.report.facts import number
-from es_service.report.markup import Markup, joined, table, tag, value_range
+from es_service.report.markup import Markup, joined, table, tables, tag, value_range
 from es_service.report.measures import CERTIFIED, measure_named, measures
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
@@ -136,7 +136,7 @@ def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
         )
         rows.append((summary.group.name, _seeds_of(summary.group), *reached, *cells))
     heads = ("group", "seeds", *solved, *heads_of.values())
-    return Markup(table(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
+    return Markup(tables(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
 
 
 def _about_intervals(groups: Sequence[Group]) -> str:

@@ -10,7 +10,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,11 +58,25 @@ def packed(values: ArrayLike, dtype: str) -> str:
     return base64.b64encode(whole.astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
 
 
+MOST_COLUMNS = 6
+"""Most columns beside the first of a table that must be seen as a whole, also on paper."""
+
+
 def table(rows: Iterable[tuple[object, ...]], head: tuple[str, ...] = (), class_: str = "fields") -> Markup:
     """A table; the first cell of each row is its heading."""
     top = tag("thead", tag("tr", *(tag("th", text, scope="col") for text in head))) if head else None
     body = [tag("tr", tag("th", first, scope="row"), *(tag("td", cell) for cell in rest)) for first, *rest in rows]
     return tag("div", tag("table", top, tag("tbody", *body), class_=class_), class_="scroll")
+
+
+def tables(rows: Sequence[tuple[object, ...]], head: tuple[str, ...], class_: str) -> Markup:
+    """A table as several ones, one below the other, each with the first column and at most MOST_COLUMNS others."""
+    parts = -(-(len(head) - 1) // MOST_COLUMNS)
+    size = -(-(len(head) - 1) // parts)
+    return joined(
+        table([(row[0], *row[at : at + size]) for row in rows], (head[0], *head[at : at + size]), class_)
+        for at in range(1, len(head), size)
+    )
 
 
 class Frame(NamedTuple):

@@ -18,6 +18,7 @@ from es_service.report.data import RunData, read_run
 from es_service.report.facts import number
 from es_service.report.figures import draw_overview, empty_figure, write_figures
 from es_service.report.floor import beside_walls
+from es_service.report.markup import MOST_COLUMNS
 from es_service.report.write import write_comparison, write_report
 from es_service.runs.run_status import GROUPS, INSIDE, write_groups
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -201,6 +202,18 @@ def words(page):
     """The text of a page, without its script and its style."""
     body = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
     return " ".join(html.unescape(re.sub("<.*?>", " ", body)).split())
+
+
+def test_final_values_are_tables_that_a_page_of_paper_has_room_for(runs):
+    final = (
+        comparison_page(runs, ["search.algorithm"], threshold=-100.0)
+        .split('<section id="final">')[1]
+        .split("</section>")[0]
+    )
+    heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head in re.findall(r"<thead>(.*?)</thead>", final)]
+    assert [head[0] for head in heads] == ["group"] * len(heads)
+    assert max(map(len, heads)) <= 1 + MOST_COLUMNS < sum(len(head) - 1 for head in heads)
+    assert {"seeds", "best fitness", "seconds"} <= {name for head in heads for name in head}
 
 
 def test_a_page_says_how_many_seeds_there_are_and_what_its_intervals_are_worth(runs):
