@@ -277,6 +277,14 @@ def place_of(text: str, option: str = "--cell") -> tuple[int, ...]:
         raise ConfigError(f"{option} {text}: must be whole numbers separated by commas, such as 3,17") from None
 
 
+BoundsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--bounds",
+        metavar="TASK=LOW,HIGH",
+        help="Compare runs of several tasks: fitness of a task that counts as 0 and as 1; for each of them.",
+    ),
+]
 RunsArgument = Annotated[
     list[Path],
     typer.Argument(parser=given_path, metavar="RUN...", help="Folders of runs or of sweeps.", show_default=False),
@@ -337,3 +345,17 @@ def readable(
 def problem_data(folder: Path, error: ServiceError) -> dict[str, str]:
     """What `--json` prints of a run that cannot be read."""
     return {"run": str(folder), "error": error.sentence}
+
+
+def bounds_of(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Bounds by task, from words such as "point_maze=-130,-25"."""
+    found = {}
+    for word in words:
+        task, _, ends = word.rpartition("=")
+        try:
+            low, high = map(float, ends.split(","))
+            found[task] = low, high
+        except ValueError:
+            what = f"--bounds {word}: write TASK=LOW,HIGH, such as point_maze=-130,-25"
+            raise ConfigError(what, field="bounds", value=word) from None
+    return found

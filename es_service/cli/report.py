@@ -12,8 +12,10 @@ import typer
 
 from es_service import api
 from es_service.cli.common import (
+    BoundsOption,
     RunArgument,
     RunsArgument,
+    bounds_of,
     evaluation_of,
     is_single,
     of_each,
@@ -60,14 +62,7 @@ def report(
     paired: Annotated[
         bool, typer.Option("--paired", help="Test groups of compared runs by pairs of equal seeds.")
     ] = False,
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--bounds",
-            metavar="TASK=LOW,HIGH",
-            help="Compare runs of several tasks: fitness of a task that counts as 0 and as 1; for each of them.",
-        ),
-    ] = None,
+    bounds: BoundsOption = None,
     label: Annotated[
         list[str] | None,
         typer.Option("--label", metavar="GROUP=TEXT", help="Show a group under another name; can be repeated."),
@@ -118,20 +113,6 @@ def report(
         figures=figures,
     ):
         print(file)
-
-
-def bounds_of(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Bounds by task, from words such as "point_maze=-130,-25"."""
-    found = {}
-    for word in words:
-        task, _, ends = word.rpartition("=")
-        try:
-            low, high = map(float, ends.split(","))
-            found[task] = low, high
-        except ValueError:
-            what = f"--bounds {word}: write TASK=LOW,HIGH, such as point_maze=-130,-25"
-            raise ConfigError(what, field="bounds", value=word) from None
-    return found
 
 
 class _How(NamedTuple):

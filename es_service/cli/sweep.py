@@ -9,10 +9,11 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import typer
@@ -24,11 +25,13 @@ from rich.text import Text
 from es_service import api
 from es_service.cli.common import (
     AddressOption,
+    BoundsOption,
     EngineOption,
     LinesOption,
     LogLevelOption,
     LogOption,
     SetOption,
+    bounds_of,
     console,
     errors,
     overrides,
@@ -98,6 +101,7 @@ def sweep(
     ] = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    bounds: BoundsOption = None,
     log: LogOption = None,
     log_level: LogLevelOption = None,
     as_json: LinesOption = False,
@@ -108,7 +112,8 @@ def sweep(
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     certifying = Certifying(points_of(certify_at or ())) if certify or certify_at else None
     options, named = _options_of_each(log, log_level), labelled(configs, label or ())
-    run_sweep(named, out, wanted, grid_of(grid or ()), seeds, parallel, options, certifying, as_json=as_json)
+    given = grid_of(grid or ()), seeds, parallel, options, certifying, bounds_of(bounds or ())
+    run_sweep(named, out, wanted, *given, as_json=as_json)
 
 
 def run_seeds(
@@ -158,12 +163,14 @@ def run_sweep(
     parallel: int | None,
     options: Sequence[str],
     certifying: Certifying | None = None,
+    bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     *,
     as_json: bool,
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed.
 
     Args:
+        bounds: as of `write_comparison`.
         as_json: whether to print a line of JSON for each run that has changed, and one for the comparison.
     """
     planned = plan(configs, out, grid, None if seeds is None else seeds_of(seeds), wanted)
@@ -180,7 +187,7 @@ def run_sweep(
             f"--out {shlex.quote(str(out))}, continues"
         )
         raise
-    _compare(runs, out, (lambda file: print_json_line({"report": str(file)})) if as_json else print)
+    _compare(runs, out, bounds, (lambda file: print_json_line({"report": str(file)})) if as_json else print)
     for run in runs:
         if run.state == "stopped":
             print_note(f"{run.name} is not finished: {run.reason}. Raise budget.wall_clock_s")
@@ -192,7 +199,12 @@ def run_sweep(
         raise typer.Exit(1)
 
 
-def _compare(runs: Sequence[SweptRun], out: Path, shows: Callable[[Path], object]) -> None:
+def _compare(
+    runs: Sequence[SweptRun],
+    out: Path,
+    bounds: Mapping[str, tuple[float, float]],
+    shows: Callable[[Path], object],
+) -> None:
     """Write the page that compares the runs with a finished generation; a note if they cannot be compared."""
     from es_service.report.write import REPORT, write_comparison
 
@@ -200,10 +212,11 @@ def _compare(runs: Sequence[SweptRun], out: Path, shows: Callable[[Path], object
     if not folders:
         return
     try:
-        for file in write_comparison(folders, out / REPORT):
+        for file in write_comparison(folders, out / REPORT, bounds=bounds):
             shows(file)
     except ConfigError as error:
-        print_note(f"note: there is no comparison, since {error.sentence}")
+        several = " (--bounds of sweep and report)" if error.field == "task.environment" else ""
+        print_note(f"note: there is no comparison, since {error.sentence}{several}")
 
 
 def seeds_of(text: str) -> list[int]:

@@ -193,7 +193,7 @@ def test_a_sweep_is_sent_with_its_options_and_the_modules_of_all_its_runs(own, s
     assert "sent_searches/first.py" in package.files
     out: list[Any] = []
 
-    def took(configs, out_, wanted, values, seeds, parallel, options, certifying, as_json):
+    def took(configs, out_, wanted, values, seeds, parallel, options, certifying, bounds, as_json):
         out.append((str(configs[0].source), str(out_), wanted, values, seeds, parallel))
 
     with pytest.MonkeyPatch.context() as patch:

@@ -16,10 +16,11 @@ from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli.main import app
-from es_service.cli.sweep import grid_of, live_table, points_of, seeds_of
+from es_service.cli.sweep import _compare, grid_of, live_table, points_of, seeds_of
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
+from es_service.report import write
 from es_service.runs import sweep as sweep_commands
 from es_service.runs import worker_count
 from es_service.runs.sweep import INSIDE, Certifying, SweptRun, command_of, sweep
@@ -270,6 +271,20 @@ def test_a_run_is_certified_at_points_of_cost_and_at_its_end(tmp_path, monkeypat
     ):
         steps[0], done[:] = now, known
         assert words(env_steps=[9000], cpu_s=[120, 55.5])[-len(expected) :] == expected
+
+
+def test_the_page_of_a_sweep_over_several_tasks_needs_bounds_and_says_where_to_give_them(tmp_path, monkeypatch, capsys):
+    def wrote(folders, file, *, bounds):
+        if not bounds:
+            raise ConfigError("task.environment differs", field="task.environment")
+        return [(folders, file, bounds)]
+
+    monkeypatch.setattr(write, "write_comparison", wrote)
+    run, shown = SweptRun("a", tmp_path / "a", {}, "finished", {"generation": 1}), []
+    _compare([run], tmp_path, {}, shown.append)
+    assert "task.environment differs (--bounds of sweep and report)" in " ".join(capsys.readouterr().err.split())
+    _compare([run], tmp_path, {"a": (0.0, 1.0)}, shown.append)
+    assert shown == [([run.folder], tmp_path / "report.html", {"a": (0.0, 1.0)})]
 
 
 def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):
