@@ -46,6 +46,8 @@ class Average(NamedTuple):
     iqm: float | None
     """Interquartile mean; None if a run never reached a target."""
     iqm_interval: Ends | None
+    reached: int = 0
+    """Number of runs with a finite value: if it is the cost of a target, those that reach it."""
 
 
 class Pair(NamedTuple):
@@ -163,6 +165,7 @@ def _average(group: Group, values_R: list[NDArray[np.float64]]) -> Average:
         statistics.interval_of_median(values_R) if group.are_independent else None,
         float(statistics.iqm(values_R)) if is_finite else None,
         statistics.interval(statistics.iqm, values_R) if is_finite and group.are_independent else None,
+        int(np.isfinite(np.concatenate(values_R)).sum()),
     )
 
 
@@ -186,11 +189,14 @@ def section_of(groups: Sequence[Group], threshold: float | None, paired: bool = 
     if len(groups) < 2 or min(len(group.runs) for group in groups) < 2:
         return None
     parts: list[Markup] = []
-    for measure in compared(groups, threshold, paired=paired):
+    measures = compared(groups, threshold, paired=paired)
+    for measure in measures:
         averages = [
             (
                 average.group,
-                f"{average.runs}",
+                f"{average.runs}"
+                if average.reached == average.runs
+                else f"{average.reached} of {average.runs} reach it",
                 _with_ends(average.median, average.median_interval),
                 "-" if average.iqm is None else _with_ends(average.iqm, average.iqm_interval),
             )
@@ -216,7 +222,10 @@ def section_of(groups: Sequence[Group], threshold: float | None, paired: bool = 
             ),
             tag("p", _smallest(measure), class_="note"),
         ]
-    return section("Between groups", *parts, tag("p", _explained(groups, paired), class_="note"), id_="between")
+    explained = _explained(groups, paired)
+    if any(average.iqm is None for measure in measures for average in measure.averages):
+        explained += " Runs that never reach a target count as equal and as worse than all that do; they have no mean."
+    return section("Between groups", *parts, tag("p", explained, class_="note"), id_="between")
 
 
 def p_text(p: float) -> str:
@@ -225,8 +234,13 @@ def p_text(p: float) -> str:
 
 
 def _with_ends(value: float, ends: Ends | None) -> Markup:
-    shown = "" if ends is None or np.isnan(ends[0]) or ends[0] == ends[1] else f"{number(ends[0])} to {number(ends[1])}"
-    return tag("div", number(value), tag("div", shown, class_="note") if shown else None)
+    shown = "" if ends is None or np.isnan(ends[0]) or ends[0] == ends[1] else f"{_known(ends[0])} to {_known(ends[1])}"
+    return tag("div", _known(value), tag("div", shown, class_="note") if shown else None)
+
+
+def _known(value: float) -> str:
+    """A number, or that a target is never reached, whose cost is infinite."""
+    return "never" if value == np.inf else number(value)
 
 
 def _smallest(measure: Compared) -> str:

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -236,7 +236,8 @@ def sweep(
             reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
     """
     folder = given_path(out)
-    given = certify_at if isinstance(certify_at, Mapping) else {"env_steps": certify_at}
+    is_named = isinstance(certify_at, Mapping)
+    given = cast("Mapping[str, Iterable[float]]", certify_at if is_named else {"env_steps": certify_at})
     if unknown := [key for key in given if key not in COSTS]:
         raise unknown_name("cost", unknown[0], COSTS, "certify_at")
     points = {key: values for key, of in given.items() if (values := tuple(of))}

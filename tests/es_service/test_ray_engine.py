@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from es_service.protocol.system import cpu_seconds
 
 from es_service.dispatch import ray_calls, waits
 from es_service.dispatch import ray_engine as ray_engine_module
@@ -31,6 +30,7 @@ from es_service.dispatch.ray_calls import IN_CALL_BYTES, Looks
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, Work, with_subject
 from es_service.protocol.recipes import Recipes
 from es_service.protocol.sent import LEAST_BYTES, Received

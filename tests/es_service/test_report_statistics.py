@@ -192,6 +192,7 @@ def test_measures_of_groups_are_compared(runs):
     cost = by_name[between.COST]
     assert cost.averages[0].iqm is not None
     assert cost.averages[1].iqm is None  # a run never comes to the target
+    assert [(average.reached, average.runs) for average in cost.averages] == [(4, 4), (3, 4)]
     assert cost.pairs[0].difference.improvement == pytest.approx((12 * 0.5 + 4) / 16)
     assert "certified" not in by_name
 
