@@ -144,6 +144,7 @@ class Actors:
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
         options = {"num_cpus": claim.cpus, "num_gpus": claim.gpus, "max_restarts": 0, "max_task_retries": 0}
         self._class = ray.remote(**options, max_concurrency=items_at_once, concurrency_groups={LOOKS: 1})(actor)
+        self._read = ray.remote(num_cpus=0, max_retries=0)(ends_of_files)  # once, since Ray keeps each for good
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls, self._arguments = Calls(ray), Arguments(ray)
@@ -212,7 +213,7 @@ class Actors:
         if place is None or not place.logs or (nodes and place.node not in nodes):
             return ""
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(place.node, soft=False)
-        read = self._ray.remote(num_cpus=0, max_retries=0)(ends_of_files).options(scheduling_strategy=affinity)
+        read = self._read.options(scheduling_strategy=affinity)
         try:
             return self._ray.get(read.remote(place.logs, WORDS_BYTES), timeout=WORDS_S)
         except self._ray.exceptions.RayError:  # also if it takes too long
