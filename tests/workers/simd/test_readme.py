@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[3]
 README = ROOT / "workers" / "simd" / "README.md"
-TRACED_BY = f"jax=={jax.__version__}"
+TRACED_BY = f'jax=={jax.__version__}; python_version < "3.12"'
 """Other versions of JAX name the variables of a jaxpr differently, and use other primitives for the same function."""
 
 
