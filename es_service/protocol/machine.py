@@ -142,7 +142,7 @@ def cpu_seconds(processes: Iterable[int]) -> float:
     return total
 
 
-VERSION = "0.27.0"
+VERSION = "0.28.0"
 """Version of es-service, written here because the metadata of an editable installation keep the version of the last
 `pip install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")

@@ -203,7 +203,7 @@ def test_the_generation_at_the_top_of_the_guide_is_the_service_s(tmp_path):
 
 MOST = dict.fromkeys(LOOKED_AT, (400, 0, 0)) | {
     "README.md": (150, 0, 0),
-    "CHANGELOG.md": (201, 6, 0),
+    "CHANGELOG.md": (200, 0, 0),
 }
 """Guide -> the most lines, sentences of more than 35 words, and cells of more than 160 characters. They only fall."""
 
