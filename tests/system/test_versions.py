@@ -43,8 +43,7 @@ def test_the_unit_tests_pass_with_other_versions(versions, tmp_path):
     constraints.write_text(lowest() if versions == "lowest" else (ROOT / "constraints.txt").read_text())
     subprocess.run([python, "-m", "venv", tmp_path / "venv"], check=True)
     environment = tmp_path / "venv/bin/python"
-    subprocess.run([environment, "-m", "pip", "install", "-q", "-c", constraints, f"{ROOT}[dev]"], check=True)
-    subprocess.run([environment, "-m", "pip", "uninstall", "-q", "-y", "es-service"], check=True)  # those of this clone
+    subprocess.run([environment, "-m", "pip", "install", "-q", "-c", constraints, "-e", f"{ROOT}[dev]"], check=True)
     quick = ["-m", "not slow and not long and not image", "-p", "no:cacheprovider", "-n", "auto", "--dist", "loadfile"]
     folders = ["tests/es_service", "tests/laws", "tests/workers"]
     cleaned = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "JAX_"))}
