@@ -30,7 +30,7 @@ import numpy as np
 CONFIGS = Path(__file__).parent / "reference_configs"
 RENAMED = {"search.step.learning_rate": "search.learning_rate"}
 """Key of a setting below -> its name before version 0.13."""
-NOT_REPEATED = ("retries", "lost_workers", "workers", "wall_clock_s", "steps_per_second")
+NOT_REPEATED = ("retries", "lost_workers", "workers", "wall_clock_s", "steps_per_second", "rollout_s", "cpu_s")
 """History columns that two equal runs may differ in; so may those that begin with "seconds_"."""
 ONE_EMITTER = ("search.emitters=1", "search.pairs=64")
 """What the config of ME-ES on PointMaze had before version 0.7."""
