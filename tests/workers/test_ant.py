@@ -71,6 +71,7 @@ def test_without_a_wall_in_reach_a_substep_is_brax_s_bit_for_bit():
     assert 0.05 < np.abs(both[0].x.pos[:, 0, :2]).max() < TRAP_M - 5.0
 
 
+@pytest.mark.long
 def test_a_control_step_is_ten_of_brax_s():
     state = start(16)
     for action in actions(16, 20):
@@ -194,6 +195,7 @@ def test_sizes_and_contact_forces():
     assert not np.delete(forces, [1, *touched], axis=1).any()
 
 
+@pytest.mark.long
 def test_landmarks_of_the_maze():
     environment, state = environment_of("ant_maze"), resets_of("ant_maze")(keys(4))
     np.testing.assert_allclose(-jax.vmap(environment.goal_distance)(state), -60.0)

@@ -33,6 +33,8 @@ from workers.viewer import scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated")
 TASKS = ("ant_maze", "ant_trap")
+ONE_TASK = pytest.mark.parametrize("task", [pytest.param("ant_maze", marks=pytest.mark.long), "ant_trap"])
+"""The maze costs as much again, so its turn is with the heavy tests."""
 TIMES = 2.0
 """99 % of errors are at most so many times as great as what one ulp of a state makes in C MuJoCo, before the step or
 after it."""
@@ -88,7 +90,7 @@ def contacts_of_ours(task: str, qpos_N: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@ONE_TASK
 def test_contacts_with_walls_are_those_of_c_mujoco(task: str):
     """Each of C MuJoCo's contacts is found and no other, of ants anywhere at walls and in corners: the two nearest
     walls of a collider are enough."""
@@ -254,7 +256,7 @@ def test_no_ant_gets_through_a_wall(task: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@ONE_TASK
 def test_replays_show_the_bodies_and_the_walls_as_high_as_those_of_springs(task: str):
     environment = make_environment(task, {"physics": "mujoco"})
     assert environment.viewer is not None

@@ -357,7 +357,7 @@ def test_what_is_too_large_is_no_fitness(fitness, why, monkeypatch):
     monkeypatch.setattr(functions, "fragile", eval(f"lambda parameters: {fitness}"))
     functions.fragile.parameters = ("x", "y")
     task = make_function_task(FRAGILE, {})
-    _, _, told = _called(task, task, np.zeros(2, np.float32), 0)
+    *_, told = _called(task, task, np.zeros(2, np.float32), 0)
     assert told.endswith(why)
 
 

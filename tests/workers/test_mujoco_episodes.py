@@ -170,6 +170,7 @@ def check(name: str) -> None:
     assert not wrong
 
 
+@pytest.mark.long
 def test_episodes_of_a_pendulum_are_gymnasiums():
     check("InvertedPendulum-v5")
 

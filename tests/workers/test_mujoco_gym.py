@@ -173,7 +173,7 @@ def compare(name: str, count: int) -> None:
     assert not name.startswith(WALKERS) or 0.02 < found.feet.mean() < 0.98
 
 
-@pytest.mark.parametrize("name", ["InvertedDoublePendulum-v5", "HalfCheetah-v5"])
+@pytest.mark.parametrize("name", ["InvertedDoublePendulum-v5", pytest.param("HalfCheetah-v5", marks=pytest.mark.long)])
 def test_a_control_step_is_gymnasiums(name: str):
     compare(name, 50)
 
@@ -228,6 +228,7 @@ def test_newtons_method_finds_the_forces_of_pgs(name: str):
     assert errors[1].max() < 1e-6
 
 
+@pytest.mark.long
 def test_a_humanoid_observes_after_a_reset_what_gymnasium_does():
     """Inertias, velocities and forces of actuators, which MuJoCo computes, and forces of contacts, which are 0."""
     built, environment = mujoco_gym.build("Humanoid-v5"), gymnasium.make("Humanoid-v5").unwrapped

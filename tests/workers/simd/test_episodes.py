@@ -60,9 +60,8 @@ def few_steps(task: str) -> WorkerSpec:
     return dataclasses.replace(task_spec(task, chunk_pairs=16, rollout_block_pairs=8), episode_steps=5)
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param("ant_trap", marks=pytest.mark.slow), pytest.param("ant_maze", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("task", ["ant_trap", "ant_maze"])
 def test_a_few_steps_of_the_ants_are_xlas(task: str):
     """Later they part, as xla's own do when a last bit changes; whole episodes: tests/benchmarks/episode_parity.py."""
     worker_spec = few_steps(task)
