@@ -5,7 +5,7 @@
     env = gymnasium.make("es_service.gymnasium:es_service/AntTrap-v0")
 
 It has an id for each shipped task, and `es_service/Task-v0` for one of your own: `task="my_module:Class"`. The classes
-are `environments.vector.TaskVectorEnv` and `environments.single.TaskEnv`. `es_service/AntMazeMujoco-v0` and
+are `environments.vector.TaskVectorEnv` and `environments.vector.TaskEnv`. `es_service/AntMazeMujoco-v0` and
 `es_service/AntTrapMujoco-v0` are the ants with `physics: mujoco` in C MuJoCo itself, which our step by MJX is compared
 with; `workers/environments/ant_gymnasium.py` has their classes. It needs the extra `gymnasium`.
 """

@@ -10,6 +10,7 @@ import pickle
 import re
 import socket
 from contextlib import suppress
+from multiprocessing import active_children
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -108,8 +109,8 @@ class WorkerActor:
             return self._run_chunks.seconds_to_compile(self._unpacked(item, arrays))
 
     def run(self, item: bytes, *arrays: bytes) -> bytes:
-        """Run chunks; returns the pickled (results, its report or None, seconds of processors that its process has
-        used), or None if it lacks arrays.
+        """Run chunks; returns the pickled (results, its report or None, seconds of processors that its process and
+        those of its cores have used), or None if it lacks arrays.
 
         Args:
             item: pickled (arrays by name, origins, work) of a `Parcel`.
@@ -124,7 +125,8 @@ class WorkerActor:
             except LackingError:
                 return pickle.dumps(None)
             self._reports.note(results := self._run_chunks(work))
-            return pickle.dumps((results, self._reports.report(), cpu_seconds(())), pickle.HIGHEST_PROTOCOL)
+            seconds = cpu_seconds(child.pid for child in active_children() if child.pid is not None)
+            return pickle.dumps((results, self._reports.report(), seconds), pickle.HIGHEST_PROTOCOL)
 
     def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""

@@ -215,7 +215,7 @@ def _compare(
         for file in write_comparison(folders, out / REPORT, bounds=bounds):
             shows(file)
     except ConfigError as error:
-        several = " (--bounds of sweep and report)" if error.field == "task.environment" else ""
+        several = " (--bounds of sweep and report)" if error.field == "task.environment" and not bounds else ""
         print_note(f"note: there is no comparison, since {error.sentence}{several}")
 
 

@@ -268,10 +268,11 @@ def problem_of(field: str, value: Any, what: str, *, suggestion: Any = None, all
 
 def unknown_name(kind: str, name: str, known: Collection[str], field: str) -> ConfigError:
     """The error for a name that is not among those of its kind: "the format cvs is unknown; must be ..."."""
+    allowed = one_of(known) if known else "left out, since there is none"
     return ConfigError(
-        f"the {kind} {name} is unknown; must be {one_of(known)}{did_you_mean(name, known)}",
+        f"the {kind} {name} is unknown; must be {allowed}{did_you_mean(name, known)}",
         field=field,
         value=name,
-        allowed=one_of(known),
+        allowed=allowed,
         suggestion=nearest(name, known),
     )

@@ -1,6 +1,5 @@
-"""What work waits for when nothing is heard of it, and the time in which workers compute.
-simulators that make and reset environments.
-"""
+"""What work waits for when nothing is heard of it: a first place in a cluster, workers that start and compile, or
+simulators that make and reset environments; and the time in which workers compute."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from typing import Any
 
 # What the operating system says of this machine and process: in the way of Linux, or in that of macOS and others.
 #
-# Calls that only Linux has are made here and in `parent.py`. A test runs those of other modules without them.
+# Calls that only Linux has are made here and in `child.py`. A test runs those of other modules without them.
 
 
 def given_path(path: str | os.PathLike[str]) -> Path:

@@ -251,7 +251,7 @@ class EvaluationChunk:
     episodes: int = EVALUATION_EPISODES_PER_CHUNK
     """Number of episodes that are wanted among the chunk's 16. The shape that is compiled has all of them."""
     first: int = 0
-    """The first of them, if this is a piece of a chunk (`protocol.pieces`)."""
+    """The first of them, if this is a piece of a chunk (`protocol.episodes`)."""
     request: int = 0
     """As for training."""
 

@@ -62,7 +62,7 @@ class PolicyChunk:
     first: int = 0
     count: int = POLICY_SLOTS
     """First wanted slot and number of wanted slots, if this is a piece of a chunk, or several chunks in one
-    (`protocol.pieces`)."""
+    (`protocol.episodes`)."""
     request: int = 0
     """As of a training chunk."""
 

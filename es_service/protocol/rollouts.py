@@ -45,7 +45,7 @@ class Rollout(Protocol):
     """Whether a process of workers may serve runs with other constants, one after another; see `staying.py`."""
     compile_s: tuple[int, int]
     """About how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with the
-    code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said.
+    code on disk, for tasks with physics (tests/benchmarks/speed.md). Other tasks have compiled before it is said.
     (0, 0) if it compiles nothing."""
     chunk_pairs: tuple[int, int] = CHUNK_PAIRS
     """Limits within which `compute.chunk_pairs: auto` chooses the largest divisor of the pairs."""

@@ -90,7 +90,8 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
             origins_of |= dict.fromkeys(named, recipes.origins)
         else:
             array: Any = subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
-            named = {name_of(array): array} if array.nbytes >= LEAST_BYTES else {}
+            shape = b"" if array.ndim == 1 else repr(array.shape).encode()  # [1, D] has the bits of [D]
+            named = {name_of(array) + shape: array} if array.nbytes >= LEAST_BYTES else {}
         needed |= named
         names |= {id(array): name for name, array in named.items()}
     arrays: dict[bytes, FloatArray] = {}

@@ -126,7 +126,9 @@ def values(groups: Sequence[Group], name: str) -> tuple[str, float, list[list[ND
     measure, value = known.get(name, (Measure("", "", ""), lambda _: np.nan))
     found = _values(groups, value)
     if any(np.isnan(np.concatenate(of_group)).any() for of_group in found):
-        raise unknown_name("measure", name, known, "metrics")
+        if name not in known:
+            raise unknown_name("measure", name, known, "metrics")
+        raise ConfigError(f"not every run has a newest value of {name}", field="metrics", value=name)
     return measure.label, -1.0 if measure.less_is_better else 1.0, found
 
 

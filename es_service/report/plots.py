@@ -242,7 +242,7 @@ def archive_profile(runs: RunSource | Several, axes: Axes, group_by: Sequence[st
 def snapshots(run: RunSource, figure: Any, count: int = 4) -> Any:
     """Draw the map of a run at equal intervals of its environment steps, side by side, the last at its end.
 
-    Each map is that of all evaluated centres until then; see `several_maps.until`.
+    Each map is that of all evaluated centres until then; see `maps.until`.
 
     Args:
         figure: an empty figure of matplotlib, or a part of one.

@@ -99,7 +99,9 @@ class RunCommands:
         limits = self.certifying.next_limits(self.planned, row, ended=state == "finished")
         if limits is None:
             return []
-        if state == "finished" or (row is not None and any(row[key] >= at for key, at in limits.items())):
+        if state == "finished" or (
+            row is not None and any(row.get(key, -math.inf) >= at for key, at in limits.items())
+        ):
             return self.certify
         return [*self.run, *(f"--set=budget.{key}={_written(key, at)}" for key, at in limits.items())]
 

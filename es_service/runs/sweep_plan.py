@@ -46,8 +46,8 @@ def settings_words(settings: Mapping[str, Any]) -> str:
 def _meaning_of_null(key: str) -> str:
     """What the description of a key says of null; "none" if it says nothing short."""
     field = FIELDS.get(key) or all_search_fields(ALGORITHMS).get(key)
-    found = re.search(r"\bnull`?: ([^.,;]{1,40})[.,;]", (field and field.description) or "")
-    return found[1] if found else "none"
+    found = re.search(r"\bnull`?: ([^,;]{1,40}?)(?:[,;]|\.(?=\s|$))", (field and field.description) or "")
+    return found[1].replace("`", "") if found else "none"
 
 
 SEED, ENVIRONMENT = "seed", "task.environment"

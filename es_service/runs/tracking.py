@@ -27,7 +27,7 @@ from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import Row
 from es_service.runs.session import OnNotice
 from es_service.runs.view import Run, open_run
-from es_service.store.reader import read_history, records_metrics
+from es_service.store.reader import read_history
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 """Name of a tracker, which is also that of the extra of this package -> the module that it needs."""
@@ -78,10 +78,10 @@ def fill(tracker: Tracker, run: Run, newest: int, *, has_ended: bool = True) -> 
     """Send the rows after generation `newest` to a tracker; returns the newest generation that was sent.
 
     Args:
-        has_ended: whether the session has. If not, and metrics are recorded, the last row waits for those of its own.
+        has_ended: whether the session has. If not, the last row waits, since a program may record metrics of it.
     """
     while rows := read_history(run.folder, newest + 1, MOST_ROWS):
-        if not has_ended and len(rows) < MOST_ROWS and records_metrics(run.folder):
+        if not has_ended:
             rows.pop()
         if not rows:
             break

@@ -73,6 +73,8 @@ class PatientStore:
         self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table, Contents]]] = deque()
         self._metrics: dict[int, Mapping[str, float]] = {}
         self._bytes, self._again_s, self._is_held = 0, 0.0, False
+        self.has_failed = False
+        """Whether a commit has failed for another reason than that the database is held."""
         self._told: set[str] = set()
 
     def content(self, name: bytes) -> Arrays:
@@ -122,17 +124,25 @@ class PatientStore:
                     self._waiting.popleft()
                     self._bytes -= size
                     self._on_commit(generation[0])
+                    if generation[0] in self._metrics:
+                        self._record(generation[0])
                 for at in list(self._metrics):
-                    self._store.record_metrics(at, self._metrics[at])
-                    del self._metrics[at]
+                    self._record(at)
         except DatabaseHeldError:
             self._hold()
             return False
+        except (StoreError, ConfigError):
+            self.has_failed = True
+            raise
         if self._is_held:
             self._is_held = False
             self._store.lock.say()
             self._say(f"{self._file} can be written again, and everything that waited is stored")
         return True
+
+    def _record(self, generation: int) -> None:
+        self._store.record_metrics(generation, self._metrics[generation])
+        del self._metrics[generation]
 
     def finish(self) -> None:
         """Return when nothing waits. Raises Interrupted if a stop was requested before that."""
@@ -141,11 +151,14 @@ class PatientStore:
 
     def lost(self) -> DatabaseHeldError:
         """The error of a session that ends while generations wait."""
-        generations = [generation for _, _, (generation, *_) in self._waiting]
+        generations = [generation for _, _, (generation, *_) in self._waiting] or list(self._metrics)
         which = f"generation {generations[0]}" if len(generations) == 1 else f"{len(generations)} generations"
+        again = "What is lost is computed again with the same results when the run continues"
+        if not self._waiting:
+            which, again = f"metrics of {which}", "They are not recorded again"
         return DatabaseHeldError(
             f"another program holds {self._file}, so {which} could not be stored before the end; close that program. "
-            "What is lost is computed again with the same results when the run continues",
+            f"{again}",
             run=self._store.folder,
             ways_out=[WayOut("resume", "continue after the program is closed", str(self._store.folder))],
         )
@@ -197,11 +210,9 @@ def patient_store(
     try:
         yield patient
         patient.finish()
-    except (StoreError, ConfigError):
-        raise  # of a commit, which would fail again
     except BaseException as error:
-        if patient.store_waiting(PATIENCE_S):
-            raise
+        if patient.has_failed or patient.store_waiting(PATIENCE_S):
+            raise  # what could not be committed would fail again
         if isinstance(error, Interrupted | KeyboardInterrupt):
             raise patient.lost() from error
         tell(patient.lost().sentence)

@@ -74,7 +74,8 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         insert_contents(connection, beginning.contents.items())
         evaluations = iter(beginning.evaluations)
         for generation, given in enumerate(beginning.history):
-            values = {column.name: given.get(column.name) for column in meta.columns}
+            recorded = metrics.row(beginning.metrics.get(generation, {}))  # what a program has recorded is no column
+            values = {column.name: given.get(column.name) for column in meta.columns if column.name not in recorded}
             evaluated = [row_bytes(stored_values(meta.evaluation_columns, row)) for row in next(evaluations, ())]
             # The state of the newest generation is stored, but not those of the generations before it.
             state = state_sha256(state_sum(in_force if generation == beginning.newest else {}))

@@ -48,13 +48,15 @@ def recorded(
     damaged: list[int] = []
     if not are_there(connection):
         return found, damaged
-    query = "SELECT generation, named, sha256 FROM metric WHERE generation >= ? AND generation < ? ORDER BY generation"
-    for at, text, sha256 in connection.execute(query, (first, 2**62 if limit is None else first + limit)):
+    columns = "generation, CAST(named AS BLOB), CAST(sha256 AS BLOB)"  # a damaged text may be no UTF-8
+    query = f"SELECT {columns} FROM metric WHERE generation >= ? AND generation < ? ORDER BY generation"
+    for at, named, sha256 in connection.execute(query, (first, 2**62 if limit is None else first + limit)):
         try:
-            if text_sha256(f"metric {at}", text) != sha256:
+            text = named.decode()
+            if text_sha256(f"metric {at}", text).encode() != sha256:
                 raise Damaged("they do not match their SHA-256")
             found[at] = facts(text, _Named, "its metrics")
-        except (Damaged, TypeError, AttributeError):
+        except (Damaged, TypeError, AttributeError, UnicodeDecodeError):
             damaged.append(at)
     return found, damaged
 

@@ -93,12 +93,6 @@ def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
         return history | metrics.columns(metrics.sound(connection, 0, limit), history["generation"])
 
 
-def records_metrics(folder: Path) -> bool:
-    """Whether a program has recorded metrics in the run."""
-    with reading(folder) as (connection, _):
-        return metrics.are_there(connection)
-
-
 def read_metrics(folder: Path, newest: int) -> dict[int, dict[str, float]]:
     """Metrics that were recorded up to generation `newest`, by generation and by name."""
     with reading(folder) as (connection, _):

@@ -200,6 +200,8 @@ def main() -> None:
         for config, most in chosen
         if given.seeds or seed < most
     ]
+    if not wanted:
+        parser.error(f"in MuJoCo there are {', '.join(MUJOCO_SEEDS)} on {' and '.join(IN_C)}")
     if not given.table:
         compute(missing(wanted, read(path)), run_one, lambda rows: keep(path, rows), RUNS)
     print(in_words(read(path), "elsewhere_" if in_mujoco else ""))

@@ -105,9 +105,10 @@ def disturbed(folder: Path, minutes: float) -> tuple[dict[str, int], pd.DataFram
             processes = {node: hosts.processes(node) for node in NODES}
             workers = [pid for node in NODES for pid, command in processes[node].items() if "WorkerActor" in command]
             if now_s > kill_s and workers:
-                kill_s, kills = now_s + chance.uniform(*KILLS_S), kills + 1
+                kill_s = now_s + chance.uniform(*KILLS_S)
                 with suppress(ProcessLookupError):  # it has ended by itself
                     os.kill(chance.choice(workers), signal.SIGKILL)
+                    kills += 1
             looks.append(
                 {
                     "minute": now_s / 60,

@@ -258,10 +258,11 @@ def test_who_asks_and_tells_records_numbers_of_the_generation(tmp_path):
     assert history.metric_loss.tolist() == history.index.tolist() == [0, 1, 2, 3]
 
 
-def test_damaged_metrics_are_refused_and_deleted_when_the_run_goes_on(tmp_path):
+@pytest.mark.parametrize("damage", ["'{\"loss\": 9.0}'", "CAST(X'FF' AS TEXT)"])
+def test_damaged_metrics_are_refused_and_deleted_when_the_run_goes_on(tmp_path, damage):
     folder = api.run(SMALL, tmp_path / "run", on_generation=noting).run.folder
     with closing(sqlite3.connect(folder / DATABASE)) as connection, connection:
-        connection.execute("UPDATE metric SET named = '{\"loss\": 9.0}' WHERE generation = 2")
+        connection.execute(f"UPDATE metric SET named = {damage} WHERE generation = 2")
     with pytest.raises(StoreError, match="the metrics recorded at generation 2 are damaged"):
         read_history(folder)
     write_report(folder, tmp_path / "report.html")

@@ -25,13 +25,14 @@ from es_service.dispatch.ray_nodes import ONE_CORE
 from es_service.errors import EvaluationError
 from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import Child, socket_pair
-from es_service.protocol.messages import Work
+from es_service.protocol.messages import TrainingChunk, Work, with_subject
 from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.policies import Policies
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
-from es_service.protocol.sent import Received
+from es_service.protocol.sent import Memory, Received, parcel
 from tests.es_service.test_ray_engine import PretendedRay
-from tests.helpers import spec
+from tests.helpers import centre, spec
 from workers import process
 from workers.actor import WorkerActor
 from workers.compilable import Compilable
@@ -227,3 +228,17 @@ def test_what_was_sent_with_an_item_that_failed_is_not_sent_again():
     assert [type(one) for one in heard] == [Placed, WorkerUp, Compiled, Failure, Answer]
     assert heard[-1].results == made(work)
     assert (len(transport.sent[0]) > 0, transport.sent[1]) == (True, [])
+
+
+def test_a_policy_alone_is_not_taken_for_a_centre_with_the_same_bits():
+    """Items with both are under way at a time, so that one worker has both."""
+    parameters_D = np.arange(2048, dtype=np.float32)
+    alone = policy_work(parameters_D[None], no_statistics(1, 2), 4, seed=0, generation=1).work
+    as_centre = with_subject(centre(parameters_D), [TrainingChunk(1, 0)])
+    sender, worker = Memory(2**20, int), Received(2**20, Recipes.made)
+    for work in (as_centre, alone, as_centre):
+        arrays, origins, written = parcel(work, sender)
+        worker.add(arrays)
+        [(subject, _)] = worker.work(origins, written)
+        found = subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
+        np.testing.assert_array_equal(found, parameters_D[None] if work is alone else parameters_D, strict=True)

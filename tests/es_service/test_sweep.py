@@ -109,6 +109,7 @@ def test_settings_are_named_in_words():
     settings = {"search.algorithm": "me_es", "novelty.newest": None, "search.sigma": 0.1, "map.correct_every": None}
     assert settings_words(settings) == "me_es, newest = no limit, sigma = 0.1, correct_every = never"
     assert settings_words({"search.a": 1, "map.a": None}) == "search.a = 1, map.a = none"
+    assert settings_words({"search.step.max_speed": None}) == "max_speed = learning_rate / 0.75"
 
 
 def test_all_problems_of_all_runs_are_one_message(tmp_path):

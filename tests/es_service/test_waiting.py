@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 
 from es_service import api
-from es_service.errors import DatabaseHeldError, EvaluationError, Interrupted
+from es_service.errors import ConfigError, DatabaseHeldError, EvaluationError, Interrupted
 from es_service.runs import waiting
 from es_service.runs.certification import certify_run
 from es_service.runs.run_status import read_status, state
@@ -237,3 +237,9 @@ def test_an_error_of_the_rollouts_is_what_is_raised_and_a_notice_says_what_is_lo
     with pytest.raises(EvaluationError, match="no worker"):
         interrupted(tmp_path / "run", EvaluationError("no worker"), last=4, tell=notices.append)
     assert "2 generations could not be stored before the end" in notices[-1]
+
+
+def test_a_wrong_answer_of_the_caller_loses_no_generation_that_waits(tmp_path):
+    with pytest.raises(ConfigError, match="wrong"):
+        interrupted(tmp_path / "run", ConfigError("wrong"), last=6, leaves=True)
+    assert read_generation(tmp_path / "run") == 6

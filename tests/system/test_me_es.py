@@ -113,7 +113,7 @@ def test_a_run_that_starts_from_another_s_centre_starts_with_the_statistics_that
     begun = run(tmp_path / "begun", f"search.init_from={origin.folder}", "budget.generations=1")
     map_, elites = begun.elites()
     (first,) = (elites[int(cell)] for cell, at in zip(map_.cell_N, map_.generation_N, strict=True) if at == 0)
-    np.testing.assert_array_equal(first.centre_D, centre.parameters_D)
+    np.testing.assert_array_equal(first.parameters_D, centre.parameters_D)
     np.testing.assert_array_equal(first.observation_mean_O, centre.observation_mean_O)
     np.testing.assert_array_equal(first.observation_std_O, centre.observation_std_O)
 

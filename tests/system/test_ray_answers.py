@@ -16,8 +16,10 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_cluster import connect, disconnect
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk, WorkerPlace, with_subject
+from es_service.protocol.messages import TrainingChunk, with_subject
 from es_service.protocol.process_environment import worker_environment
+from es_service.protocol.recipes import Recipes
+from es_service.protocol.sent import Received
 from es_service.store.digest import digest_parts
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from tests.system import test_evaluator, test_map_elites
@@ -130,30 +132,22 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
         engine.evaluate(with_subject(centre(wrong), [TrainingChunk(1, 0)]))
 
 
-class Mirror:
+class Mirror(WorkerActor):
     """An actor that answers each chunk with the environment its worker would have, and Ray's name for its GPU."""
 
-    def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
-        self.gpus = gpus
-
-    def place(self) -> WorkerPlace:
-        return WorkerPlace("host", os.getpid(), "node")
-
-    def progress(self) -> tuple[int, str, int, int]:
-        return 0, "", 0, 0
-
     def build(self) -> str:
+        self._received = Received(2**20, Recipes.made)
         return "a mirror's"
 
-    def compile(self, chunks: bytes, *centres: bytes) -> float:
+    def compile(self, item: bytes, *arrays: bytes) -> float:
         return 0.0
 
-    def run(self, chunks: bytes, *centres: bytes) -> bytes:
+    def run(self, item: bytes, *arrays: bytes) -> bytes:
         import ray
 
         ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-        answer = os.getpid(), ids, worker_environment(os.environ, self.gpus)
-        return pickle.dumps(([answer for _ in pickle.loads(chunks)[1]], None))
+        answer = os.getpid(), ids, worker_environment(os.environ, self._gpus)
+        return pickle.dumps(([answer for _ in self._unpacked(item, arrays)], None, 0.0))
 
 
 def mirrored(workers: int, gpus: float = 0.0) -> list[tuple[int, list[str], dict[str, str]]]:

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PYTHONS = ("python3.13", "python3.12")
-pytestmark = [pytest.mark.long, pytest.mark.timeout(7200)]
+pytestmark = [pytest.mark.long, pytest.mark.alone, pytest.mark.timeout(7200)]
 
 
 def other_python() -> str:
