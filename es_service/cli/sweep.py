@@ -9,7 +9,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -174,6 +174,7 @@ def run_sweep(
         as_json: whether to print a line of JSON for each run that has changed, and one for the comparison.
     """
     planned = plan(configs, out, grid, None if seeds is None else seeds_of(seeds), wanted)
+    _check_bounds(bounds, {run.config.task.environment for run in planned})
     for config in configs:
         print_config_notes(config.source, [run.config for run in planned if run.source == config.source])
     for note in left_out_notes(planned):
@@ -197,6 +198,18 @@ def run_sweep(
     if failed:
         print_note("the same command again resumes the runs that failed")
         raise typer.Exit(1)
+
+
+def _check_bounds(bounds: Mapping[str, tuple[float, float]], tasks: Set[str]) -> None:
+    """Raise ConfigError for bounds of another task, and for a task that lacks them where others have some."""
+    if not bounds:
+        return
+    from es_service.report.compare import bounds_of_task
+
+    for task in sorted(bounds.keys() - tasks):
+        raise unknown_name("task", task, sorted(tasks), "bounds")
+    for task in sorted(tasks):
+        bounds_of_task(bounds, task)
 
 
 def _compare(

@@ -162,20 +162,26 @@ def normalised(runs: Sequence[RunData], bounds: Mapping[str, tuple[float, float]
         return list(runs)
     found = []
     for run in runs:
-        low, high = bounds.get(task := run.constants[ENVIRONMENT], (0.0, 0.0))
-        if low == high:
-            raise ConfigError(
-                f"bounds: {task} has {'equal ones' if task in bounds else 'none'}; name the fitness that counts as 0 "
-                f"and as 1, such as {task}=-130,-25",
-                field="bounds",
-                value=bounds.get(task),
-            )
+        low, high = bounds_of_task(bounds, run.constants[ENVIRONMENT])
         history = {name: run.history[name] for name in SAME_IN_ALL_TASKS if name in run.history}
         history |= {name: (run.history[name] - low) / (high - low) for name in NORMALISED if name in run.history}
         if GAP in run.history:
             history[GAP] = run.history[GAP] / (high - low)
         found.append(replace(run, history=history, map=None, bounds_of_fitness=(low, high)))
     return found
+
+
+def bounds_of_task(bounds: Mapping[str, tuple[float, float]], task: str) -> tuple[float, float]:
+    """The fitness of a task that counts as 0, and that which counts as 1. Raises ConfigError if there are not two."""
+    low, high = bounds.get(task, (0.0, 0.0))
+    if low == high:
+        raise ConfigError(
+            f"bounds: {task} has {'equal ones' if task in bounds else 'none'}; name the fitness that counts as 0 "
+            f"and as 1, such as {task}=-130,-25",
+            field="bounds",
+            value=bounds.get(task),
+        )
+    return low, high
 
 
 def value_column(runs: Sequence[RunData]) -> str:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli.main import app
-from es_service.cli.sweep import _compare, grid_of, live_table, points_of, seeds_of
+from es_service.cli.sweep import _check_bounds, _compare, grid_of, live_table, points_of, seeds_of
 from es_service.config.text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
@@ -286,6 +286,18 @@ def test_the_page_of_a_sweep_over_several_tasks_needs_bounds_and_says_where_to_g
     assert "task.environment differs (--bounds of sweep and report)" in " ".join(capsys.readouterr().err.split())
     _compare([run], tmp_path, {"a": (0.0, 1.0)}, shown.append)
     assert shown == [([run.folder], tmp_path / "report.html", {"a": (0.0, 1.0)})]
+
+
+def test_bounds_of_tasks_are_checked_before_a_run_starts():
+    tasks = {"ant_maze", "point_maze"}
+    _check_bounds({}, tasks)
+    _check_bounds({"ant_maze": (0.0, 1.0), "point_maze": (-130.0, -25.0)}, tasks)
+    with pytest.raises(
+        ConfigError, match="the task point_maz is unknown; must be ant_maze or point_maze; did you mean"
+    ):
+        _check_bounds({"ant_maze": (0.0, 1.0), "point_maz": (-130.0, -25.0)}, tasks)
+    with pytest.raises(ConfigError, match="bounds: point_maze has none; name the fitness"):
+        _check_bounds({"ant_maze": (0.0, 1.0)}, tasks)
 
 
 def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):
