@@ -46,13 +46,17 @@ def read_config(source: str | os.PathLike[str]) -> Mapping[object, object]:
     """The top-level mapping of a config file, given by its path or by the name of a shipped config.
 
     Raises:
-        ConfigError: as `read_yaml_file`; if there is no such file, with the shipped config whose name is similar.
+        ConfigError: as `read_yaml_file`; if there is no such file, with the shipped config whose name is similar, or
+            what to do with the name of a task.
     """
     file = config_file(source)
     near = None if file.exists() else nearest(file.name.removesuffix(".yaml"), shipped_configs())
-    if near is None:
+    hint = f"did you mean the shipped config {near}?"
+    if near is None and not file.exists() and ":" in file.name:
+        hint = f"a task is given with a config, such as: point_maze_es --set task.environment={file.name}"
+    elif near is None:
         return read_yaml_file(file)
-    problem = Problem(f"no such file; did you mean the shipped config {near}?", "config", str(file), suggestion=near)
+    problem = Problem(f"no such file; {hint}", "config", str(file), suggestion=near)
     raise ConfigError.listing(f"{file}: 1 problem", [problem])
 
 

@@ -246,7 +246,12 @@ def _of_another_task(file: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict
     if not _is_replaced("task.environment", file, wanted):
         return {}
     why = f"{wanted['task.environment']} replaces its task"
-    return {key: why for key in file if (key.startswith(TASK_OPTIONS) or key in CHOICES) and key not in wanted}
+
+    def is_of_task(key: str) -> bool:
+        is_target = key.startswith("budget.target_") and file[key] is not None  # a fitness, which is that of its task
+        return is_target or key.startswith(TASK_OPTIONS) or key in CHOICES
+
+    return {key: why for key in file if key not in wanted and is_of_task(key)}
 
 
 def _of_another_method(

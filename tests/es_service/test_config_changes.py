@@ -67,6 +67,15 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
         assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")], ALGORITHMS).ways_out] == ["run"]
 
 
+def test_a_target_of_the_fitness_goes_with_its_task():
+    source = MINIMAL | {"budget": {"generations": 9, "target_fitness": -26.0, "target_certified": None}}
+    other, there = {"tasks": SHIPPED, "algorithms": ALGORITHMS, "rollouts": BACKENDS}, "task.environment=ant_maze"
+    assert load_config(source, [there], **other).budget.target_fitness is None
+    assert left_out(source, [there], **other) == {"budget.target_fitness": "ant_maze replaces its task"}
+    assert load_config(source, [there, "budget.target_fitness=-5"], **other).budget.target_fitness == -5.0
+    assert load_config(source, **other).budget.target_fitness == -26.0
+
+
 def test_another_task_has_its_own_default_options():
     source = MINIMAL | {"task": {"environment": "point_maze", "options": {"start": "corner"}}}
     other = {"tasks": SHIPPED, "algorithms": ALGORITHMS, "rollouts": BACKENDS}

@@ -75,3 +75,8 @@ def test_every_package_is_installed():
     data = {"es_service.guides", "es_service.report.assets", "es_service.watch.assets"}
     assert set(packages) == found | data | {"es_service.shipped_configs", "es_service.launch_files"}
     assert len(packages) == len(set(packages))
+
+
+def test_a_task_in_the_place_of_a_config_says_where_it_belongs():
+    with pytest.raises(ConfigError, match=r"point_maze_es --set task\.environment=gymnasium:Pendulum-v1"):
+        load_config("gymnasium:Pendulum-v1")
