@@ -21,7 +21,7 @@ from es_service.runs import view
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, warn
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, show_notice
 from es_service.runs.sessions import Listener, continue_run, create_run, outcome_of
 from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
@@ -74,7 +74,7 @@ def run(
     out: str | os.PathLike[str] | None = None,
     *,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = warn,
+    on_notice: OnNotice = show_notice,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     on_output: OnNotice = _ignore,
@@ -91,7 +91,7 @@ def run(
             with this reason, and can be resumed. A mapping from names to numbers that it returns, or
             `Stop("reason", {...})`, records these as `metric_NAME` of the generation: columns of the history, curves,
             metrics of trackers, and measures of comparisons. Other values have no effect.
-        on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
+        on_notice: called with each notice for the user; by default, each is printed as a line on stderr.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.
         on_compile: called with a sentence when workers compile, or make environments, for more than two seconds.
@@ -127,7 +127,7 @@ def resume(
     *,
     strict: bool = False,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = warn,
+    on_notice: OnNotice = show_notice,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     on_output: OnNotice = _ignore,
@@ -161,7 +161,7 @@ def run_or_resume(
     out: str | os.PathLike[str],
     *,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = warn,
+    on_notice: OnNotice = show_notice,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     on_output: OnNotice = _ignore,
@@ -191,7 +191,7 @@ def fork(
     generation: int | None = None,
     out: str | os.PathLike[str] | None = None,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = warn,
+    on_notice: OnNotice = show_notice,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     on_output: OnNotice = _ignore,

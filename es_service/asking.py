@@ -40,7 +40,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
 )
 from es_service.runs.checked_config import load_config
-from es_service.runs.session import OnNotice, Outcome, checked_metrics, warn
+from es_service.runs.session import OnNotice, Outcome, checked_metrics, show_notice
 from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
@@ -273,7 +273,7 @@ class AskTell:
 
 @contextmanager
 def ask_tell(
-    config: RunConfig | Source, out: str | os.PathLike[str], *, on_notice: OnNotice = warn
+    config: RunConfig | Source, out: str | os.PathLike[str], *, on_notice: OnNotice = show_notice
 ) -> Iterator[AskTell]:
     """Begin or resume a run whose episodes the caller computes.
 

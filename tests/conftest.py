@@ -46,6 +46,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: (item.path.name != "test_ant.py", -slow[item.path]))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def notices_fail() -> Iterator[None]:
+    """A notice that a test does not expect is an error, as a warning is. By default, it would only be printed."""
+
+    def fail(line: str, **where: object) -> None:
+        raise AssertionError(f"a notice that the test does not expect: {line}")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("es_service.runs.session.print", fail, raising=False)
+        yield
+
+
+@pytest.fixture
+def noticed(monkeypatch) -> list[str]:
+    """The lines of notices that a test expects where it gives no `on_notice`."""
+    lines: list[str] = []
+    monkeypatch.setattr("es_service.runs.session.print", lambda line, **where: lines.append(line), raising=False)
+    return lines
+
+
 @pytest.fixture(scope="session")
 def compiled() -> Path:
     """Folder of what all processes of the tests have compiled."""

@@ -44,7 +44,7 @@ from es_service.runs.evaluator import evaluating_config, policies_of, statistics
 from es_service.runs.identity import code_of
 from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
 from es_service.runs.selection import RANKED_BY, RankedBy, halved, kept, results_of
-from es_service.runs.session import warn
+from es_service.runs.session import show_notice
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import telling_once, when_free
 from es_service.store.reader import read_history
@@ -80,7 +80,7 @@ def certify_run(
     task: str | None = None,
     overrides: Overrides = (),
     workers: int | None = None,
-    on_notice: Callable[[str], None] = warn,
+    on_notice: Callable[[str], None] = show_notice,
     on_output: Callable[[str], None] = lambda line: None,
 ) -> list[Certified]:
     """Certify policies of a run on this machine, and store the results in the run.
@@ -100,7 +100,7 @@ def certify_run(
         overrides: its options, such as "task.options.frame_skip=5"; see `other_task`.
         workers: number of worker processes; None: one per core.
         on_notice: called with a sentence about each repair of the run, when the workers compile for more than two
-            seconds, and when the first is replaced by a new process; by default, these are RuntimeWarnings.
+            seconds, and when the first is replaced by a new process; by default, it is printed as a line on stderr.
         on_output: called with the lines that workers print; see `run`.
 
     Returns:

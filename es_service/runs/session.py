@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import warnings
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -58,9 +58,9 @@ OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
 
-def warn(notice: str) -> None:
-    """Show a notice as a RuntimeWarning; the default for `on_notice`."""
-    warnings.warn(notice, RuntimeWarning, stacklevel=2)
+def show_notice(notice: str) -> None:
+    """Print a notice as a line on stderr, as the command line does; the default for `on_notice`."""
+    print(f"note: {notice}", file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from es_service.runs import worker_count as counting
 from es_service.runs.engine import dispatch_limits
 from es_service.runs.session import initial_centres
 from es_service.runs.worker_count import on_this_machine, worker_count
+from tests.system.session import SMALL
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -116,6 +117,17 @@ def test_a_note_says_how_many_workers_start_where_not_all_have_work(tmp_path):
     few = {"search.pairs": 16, "search.evaluation_episodes": 20, "compute.max_workers_per_core": 4}
     api.run(load_config(CONFIG, {**few, "compute.workers": 3}), tmp_path / "run", on_notice=notices.append)
     assert [notice.partition(",")[0] for notice in notices] == ["compute.workers: 2 of 3 start"]
+
+
+def test_without_on_notice_a_notice_is_a_line_on_stderr(tmp_path, monkeypatch, capsys):
+    monkeypatch.delattr("es_service.runs.session.print")  # which makes it an error in tests
+    folder = api.run(SMALL | {"budget": {"generations": 1}}, tmp_path / "run").run.folder
+    assert capsys.readouterr() == ("", "")
+    api.fork(folder, out=tmp_path / "fork")
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("note: no generation was run")
+    assert printed.err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

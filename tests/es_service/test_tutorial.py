@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from es_service.cli.main import app
 from tests.examples import tutorial
 
-pytestmark = pytest.mark.filterwarnings("ignore:compiling for river:RuntimeWarning")  # on a busy machine
+pytestmark = pytest.mark.usefixtures("noticed")  # on a busy machine, certifying says that it compiles
 
 
 @pytest.fixture
