@@ -32,7 +32,7 @@ from es_service.loop.interfaces import Stop
 from es_service.loop.state import no_observations
 from es_service.protocol.episodes import DispatchCounts, Session
 from es_service.protocol.machine import platform_info
-from es_service.protocol.messages import FloatArray, Moments
+from es_service.protocol.messages import FloatArray, Moments, TaskSpec
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.runs.engine import make_engine, reader_of_reports
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
@@ -51,6 +51,8 @@ from workers.policies.policy import initial_parameters
 _LOG = logger(__name__)
 LONG_PLACING_S = 2.0
 """Time from which on it is said that centroids are placed."""
+ALIKE_GENERATIONS = 20
+"""Generation at which a run says that all its centres have had the same descriptor."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
 """Called with each history row after its generation is committed, or has begun to wait for that (`runs/waiting.py`). A
 `Stop` that it returns ends the session, and numbers by name are recorded; see `metrics_of`."""
@@ -179,8 +181,12 @@ def work(
                     "are in the log (--log-level warning)"
                 )
 
+        alike = alike_centres(config, task) if state is None else lambda row: ""
+
         def after_generation(row: Mapping[str, Any]) -> object:
             tell_notices()
+            if said_alike := alike(row):
+                tell(said_alike)
             if engine is not None and (lost := row["lost_workers"]):
                 who = "a worker" if lost == 1 else counted(lost, "worker")
                 tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
@@ -245,6 +251,36 @@ def checked_metrics(given: Mapping[str, Any], meta: RunMeta, field: str) -> dict
                 allowed="a number",
             ) from None
     return metrics
+
+
+def alike_centres(config: RunConfig, task: TaskSpec) -> Callable[[Mapping[str, Any]], str]:
+    """Function of each history row of a new run that says, at `ALIKE_GENERATIONS`, if all evaluations so far had the
+    same descriptor. Else it returns "", and always for a search that looks at fitness alone."""
+    columns = [f"centre_{name}" for name in task.descriptor_names]
+    needs_descriptor, is_same, first_B = bool(config.search.needs_map), True, []
+
+    def sentence(row: Mapping[str, Any]) -> str:
+        nonlocal needs_descriptor, is_same, first_B
+        descriptor_B = [row[column] for column in columns]
+        first_B = first_B or descriptor_B
+        is_same &= descriptor_B == first_B and not any(row[f"{column}_std"] for column in columns)
+        needs_descriptor |= row["fitness_weight"] < 1.0
+        is_due = row["generation"] == ALIKE_GENERATIONS
+        where = f"all evaluations of {ALIKE_GENERATIONS} generations"
+        return same_descriptor(task, first_B, where) if is_due and is_same and needs_descriptor else ""
+
+    return sentence
+
+
+def same_descriptor(task: TaskSpec, descriptor_B: Sequence[float], where: str) -> str:
+    """That a descriptor was the same in these episodes, what follows from it, and what can be done."""
+    values = ", ".join(f"{name} = {value:g}" for name, value in zip(task.descriptor_names, descriptor_B, strict=True))
+    return (
+        f"the descriptor was the same in {where}: {values}. As long as it is, a search for novelty or with a behaviour "
+        "map cannot tell one policy from another. Choose another descriptor (`task.descriptor` with gymnasium:ID, "
+        "`task.options.descriptor` with other suites, `descriptor(self)` in a class of your own), or a method that "
+        "needs none"
+    )
 
 
 def _placing_sentence(config: MapConfig) -> str:

@@ -76,6 +76,55 @@ def test_what_has_no_effect_is_noted_and_a_run_notes_it_once(tmp_path, one_proce
     assert notices == [note]
 
 
+class Still(Misnamed):
+    """a point stays where it is; its episodes differ in nothing but their number of steps"""
+
+    descriptor_names, descriptor_bounds = ("steps",), ((0.0, 3.0),)
+
+    def descriptor(self, state):
+        return jnp.full(1, 3.0)
+
+
+class FromZero(Still):
+    """a point begins at 0 and moves by its action, which is 0 there for a policy without biases"""
+
+    def reset(self, key):
+        return jnp.zeros(1)
+
+    def step(self, state, action):
+        return state + action, state[0], False
+
+    def descriptor(self, state):
+        return state
+
+
+@pytest.mark.slow
+def test_a_descriptor_that_is_the_same_in_all_episodes_is_noted_also_by_a_run_that_needs_it(tmp_path, one_process):
+    def told(search, generations=21, environment=f"{__name__}:Still"):
+        notices: list[str] = []
+        settings = {
+            "task": {"environment": environment},
+            "policy": {"hidden": []},
+            "search": {"evaluation_episodes": 1, **search},
+            "budget": {"generations": generations},
+            "compute": {"engine": "inline", "workers": 1, "rollout": "xla"},
+        }
+        api.run(settings, tmp_path / f"{search['algorithm']}_{environment}_{generations}", on_notice=notices.append)
+        return [notice for notice in notices if "wals" not in notice]
+
+    [said] = (sentence for level, sentence in findings(f"{__name__}:Still") if "descriptor was the same" in sentence)
+    assert said.startswith("the descriptor was the same in 8 episodes of random policies: steps = 3. ")
+    for other in ("Misnamed", "FromZero"):
+        assert not any("the same in" in sentence for _, sentence in findings(f"{__name__}:{other}"))
+    novelty, elites = {"algorithm": "ns_es", "pairs": 4}, {"algorithm": "map_elites", "batch": 4}
+    for search in (novelty, elites):
+        [notice] = told(search)
+        assert notice.startswith("the descriptor was the same in all evaluations of 20 generations: steps = 3. ")
+        assert told(search, 19) == []
+        assert told(search, environment=f"{__name__}:Misnamed") == []
+    assert told({"algorithm": "es", "pairs": 4}) == []
+
+
 @pytest.mark.slow
 def test_what_simd_would_hide_is_a_failure_and_refused_before_a_run():
     name = "tests.workers.simd.test_trial:HiddenReward"

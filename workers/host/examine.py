@@ -1,4 +1,5 @@
-"""Try a task: whether its numbers are finite, and one of Python objects or a function whether it repeats and how fast.
+"""Try a task: whether its numbers are finite, whether its descriptor tells episodes apart, and one of Python objects or
+a function whether it repeats and how fast.
 
     python -m workers.host.examine DESCRIPTOR     # run by `es_service.protocol.child`
 
@@ -20,7 +21,7 @@ import numpy as np
 from es_service.protocol.child import answer_parent
 from es_service.protocol.machine import peak_memory_mib
 from es_service.protocol.messages import HostChoices, PolicySpec, TaskSpec, WorkerSpec
-from es_service.protocol.noise import Domain, evaluation_reset_keys, normal_integers, stream_keys
+from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.rollouts import choose
 from workers.describe import described
@@ -55,6 +56,8 @@ class Examined:
     """Most memory of the process, in MiB."""
     fault: str = ""
     """What is not finite in the first such episode of random policies, with its reset; empty if all is."""
+    same_descriptor_B: list[float] = field(default_factory=list)
+    """Descriptor of all of these episodes, if they have the same one; else empty, and for functions."""
     step: dict[str, Any] = field(default_factory=dict)
     """Of a task in JAX: the fields of `workers.step_cost.StepCost`."""
 
@@ -76,9 +79,9 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostCho
     if task.kind == "jax":
         from workers.step_cost import step_cost
 
-        fault = _fault(task, options, choices)
+        fault, same_B = _tried(task, options, choices)
         step = {} if fault else asdict(step_cost(task, options, seconds))
-        return Examined({}, 0.0, peak_memory_mib(), fault, step)
+        return Examined({}, 0.0, peak_memory_mib(), fault, same_B, step)
     made, key = (
         make_host_task(task.name, options, choices, len(task.descriptor_names)),
         stream_keys(0, Domain.ACTION_NOISE, 0, 0),
@@ -113,11 +116,13 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostCho
     several = [HostEnvironment(made) for _ in range(1 + BESIDE)]
     hashes["beside other objects"] = episodes(several, [SEED, *range(OTHER_SEED, OTHER_SEED + BESIDE)])[0]
     measured = _measured(hashes, lambda: episodes([environment], [SEED])[1], seconds)
-    return replace(measured, fault=_fault(task, options, choices))
+    fault, same_B = _tried(task, options, choices)
+    return replace(measured, fault=fault, same_descriptor_B=same_B)
 
 
-def _fault(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices) -> str:
-    """See `Examined.fault`. The episodes are those of a worker, which knows what makes an episode invalid."""
+def _tried(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices) -> tuple[str, list[float]]:
+    """`fault` and `same_descriptor_B` of `Examined`. The episodes are those of a worker, which knows what makes an
+    episode invalid."""
     policy = PolicySpec((task.observation_size, 16, task.action_size))
     rollout = choose(BACKENDS, task, policy, gpu=False, here=True)
     spec = WorkerSpec(
@@ -139,14 +144,17 @@ def _fault(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoi
         rollout=rollout,
         allow_infeasible=True,
     )
-    parameters_L_D = np.stack(
-        [EXTREME * initial_parameters(policy, "unit_columns", SEED, lane) for lane in range(TRIED)]
-    )
+    initial_L_D = np.stack([initial_parameters(policy, "unit_columns", SEED, lane) for lane in range(TRIED)])
+    keys_L = stream_keys(SEED, Domain.PARAMETER_NOISE, 0, np.arange(TRIED)).T[:, :, None]
+    noise_L_D = normal_integers(np, keys_L, np.arange(initial_L_D.shape[1], dtype=np.uint32)) / NORMAL_STD
+    parameters_L_D = (EXTREME * initial_L_D + noise_L_D).astype(np.float32)  # initial biases are 0
     mean_L_O, std_L_O = (np.full((TRIED, task.observation_size), value, np.float32) for value in (0.0, 1.0))
     keys_L_4 = evaluation_reset_keys(SEED, 0, np.arange(TRIED), 0)
     function = BACKENDS[rollout].chunk_functions(spec).policies
-    failures = function([parameters_L_D], mean_L_O, std_L_O, np.arange(TRIED), keys_L_4).failures
-    return failures[0].text if failures else ""
+    episodes = function([parameters_L_D], mean_L_O, std_L_O, np.arange(TRIED), keys_L_4)
+    descriptor_L_B = np.asarray(episodes.descriptor)
+    is_same = (descriptor_L_B == descriptor_L_B[0]).all()
+    return episodes.failures[0].text if episodes.failures else "", descriptor_L_B[0].tolist() if is_same else []
 
 
 def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -> Examined:
