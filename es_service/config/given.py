@@ -53,7 +53,7 @@ def read_config(source: str | os.PathLike[str]) -> Mapping[object, object]:
     near = None if file.exists() else nearest(file.name.removesuffix(".yaml"), shipped_configs())
     hint = f"did you mean the shipped config {near}?"
     if near is None and not file.exists() and ":" in file.name:
-        hint = f"a task is given with a config, such as: point_maze_es --set task.environment={file.name}"
+        hint = f"a task belongs into a config, such as point_maze_es with task.environment={file.name}"
     elif near is None:
         return read_yaml_file(file)
     problem = Problem(f"no such file; {hint}", "config", str(file), suggestion=near)

@@ -78,5 +78,5 @@ def test_every_package_is_installed():
 
 
 def test_a_task_in_the_place_of_a_config_says_where_it_belongs():
-    with pytest.raises(ConfigError, match=r"point_maze_es --set task\.environment=gymnasium:Pendulum-v1"):
+    with pytest.raises(ConfigError, match=r"point_maze_es with task\.environment=gymnasium:Pendulum-v1"):
         load_config("gymnasium:Pendulum-v1")
