@@ -26,7 +26,6 @@ from es_service.config.model import RunConfig
 from es_service.config.tasks import CALLER, task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
-from es_service.loop.history import Row
 from es_service.protocol.child import require_same_process
 from es_service.protocol.episodes import Session
 from es_service.protocol.machine import given_path
@@ -308,18 +307,18 @@ def ask_tell(
     task = task_of(wanted)
     metrics: dict[str, float] = {}
 
-    def told(row: Row) -> dict[str, float]:
+    def told() -> dict[str, float]:
         """The metrics that were told since the last generation."""
         given = dict(metrics)
         metrics.clear()
         return given
 
     listener = Listener(
-        lambda folder: nullcontext(told),
+        lambda folder: nullcontext(lambda row: None),
         on_notice,
         lambda sentence: None,
         lambda line: None,
-        asks_caller=True,
+        told=told,
     )
     session = begin_or_resume(wanted, folder, listener)
     spec = worker_spec(wanted, task, asks_caller=True)

@@ -19,7 +19,7 @@ from es_service.errors import ConfigError
 from es_service.report import statistics
 from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
-from es_service.report.measures import CERTIFIED, GAP, SUCCESS, has_curve, measures
+from es_service.report.measures import CERTIFIED, GAP, SUCCESS, as_compared, has_curve, measures
 from es_service.report.series import X_AXES, Chart, Line, axes_of
 from es_service.runs.sweep_plan import ENVIRONMENT, settings_words
 
@@ -293,7 +293,7 @@ def places(groups: Sequence[Group], axis: str) -> NDArray[np.float64]:
 
 def values_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values of the runs of a group at places of an axis [R, K]; NaN where a run has none."""
-    return np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
+    return np.stack([at(run.history[axis], as_compared(run.history, column), x_K) for run in group.runs])
 
 
 def at(x_G: NDArray[np.float64], y_G: NDArray[np.float64], x_K: NDArray[np.float64]) -> NDArray[np.float64]:

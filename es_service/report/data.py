@@ -22,7 +22,7 @@ from es_service.loop.history import evaluated_nouns
 from es_service.protocol.content import as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
-from es_service.report.measures import with_derived
+from es_service.report.measures import as_compared, with_derived
 from es_service.report.series import IN_EVERY_RUN, HistoryColumns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
 from es_service.runs.run_status import RunStatus, group_of, status_at
@@ -97,9 +97,10 @@ class RunData:
         return self.map.geometry.bounds if self.map is not None else self.task.descriptor_bounds
 
     def last(self, column: str) -> float:
-        """Newest value of a history column; NaN if there is none."""
-        values = self.history.get(column)
-        return float(values[-1]) if values is not None and values.size else float("nan")
+        """Newest value of a history column, for a metric the newest that was recorded; NaN if there is none."""
+        if column not in self.history or not self.history[column].size:
+            return float("nan")
+        return float(as_compared(self.history, column)[-1])
 
     @property
     def evaluated(self) -> tuple[str, str]:

@@ -120,14 +120,14 @@ def has_values(run: RunData, column: str) -> bool:
 
 
 def with_derived(history: HistoryColumns, certified: Sequence[Mapping[str, Any]], fitness: str) -> HistoryColumns:
-    """A history with the columns of certifications, in which corrected values and metrics hold until the next ones.
+    """A history with the columns of certifications, in which corrected values hold until the next ones.
 
     Args:
         certified: what `certified_over_time` returns; the value holds from the generation on from which a policy was
             taken, or from the last one, if that is not known.
         fitness: `task.fitness`.
     """
-    derived = {name: held(history[name]) for name in history if name in CORRECTED or name.startswith(METRIC)}
+    derived = {name: held(history[name]) for name in history if name in CORRECTED}
     steps_G, value = history["env_steps"], f"{measure_of(fitness)}_mean"
     if not steps_G.size:
         return history
@@ -145,6 +145,11 @@ def with_derived(history: HistoryColumns, certified: Sequence[Mapping[str, Any]]
     if CERTIFIED in derived:
         derived[GAP] = history["best_fitness"] - derived[CERTIFIED]
     return {**history, **derived}
+
+
+def as_compared(history: HistoryColumns, column: str) -> NDArray[np.float64]:
+    """A column as runs are compared by it, [G]: a metric that only some generations have holds until its next value."""
+    return held(history[column]) if column.startswith(METRIC) else history[column]
 
 
 def held(values_G: NDArray[np.float64]) -> NDArray[np.float64]:

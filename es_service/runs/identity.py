@@ -131,6 +131,7 @@ class Recorder:
         history: HistoryRow,
         evaluations: Table,
         contents: Contents,
+        recorded: Mapping[str, float],
     ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 
@@ -156,4 +157,4 @@ class Recorder:
                     f"from generation {generation} on, this run is computed on another platform, or on several: "
                     f"{in_words(changes)}. {MIXED}"
                 )
-        self._store.commit(generation, parts, history, evaluations, contents)
+        self._store.commit(generation, parts, history, evaluations, contents, recorded)

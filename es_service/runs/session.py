@@ -56,6 +56,8 @@ ALIKE_GENERATIONS = 20
 OnGeneration = Callable[[Mapping[str, Any]], object]
 """Called with each history row after its generation is committed, or has begun to wait for that (`runs/waiting.py`). A
 `Stop` that it returns ends the session, and numbers by name are recorded; see `metrics_of`."""
+Told = Callable[[], Mapping[str, float]]
+"""Returns the metrics that a caller has told of the generation that is being stored, in whose transaction they are."""
 OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
@@ -86,7 +88,7 @@ def work(
     on_output: OnNotice,
     *,
     strict: bool = False,
-    asks_caller: bool = False,
+    told: Told | None = None,
 ) -> Session[Outcome]:
     """Run generations until the budget is spent or `on_generation` returns a `Stop`. The configured engine computes
     their work, so that nothing is yielded, unless the caller does.
@@ -96,21 +98,22 @@ def work(
             before centroids are placed for some time.
         on_output: called with each line that a worker prints, after the worker.
         strict: whether workers on another platform than the run's are an error.
-        asks_caller: whether work is yielded, because the task has no episodes of its own.
+        told: metrics of the caller, to whom work is yielded because the task has no episodes of its own; None: an
+            engine computes.
     """
-    task = task_of(config)
+    task, asks_caller = task_of(config), told is not None
     store.keep_every = config.store.keep_every
-    told, said_failed = 0, False
+    notices, said_failed = 0, False
 
     def tell(notice: str) -> None:
         _LOG.warning(notice)
         on_notice(notice)
 
     def tell_notices() -> None:
-        nonlocal told
-        for notice in store.notices[told:]:
+        nonlocal notices
+        for notice in store.notices[notices:]:
             tell(notice)
-        told = len(store.notices)
+        notices = len(store.notices)
 
     def tell_wait(shortage: str) -> None:
         store.lock.say(waiting=bool(shortage))
@@ -213,7 +216,8 @@ def work(
         if state is None and (placing := _placing_sentence(config.map)):
             _LOG.info(placing)
             on_compile(placing)
-        with patient_store(store, recorder, should_stop, tell, lambda stored: log(Committed(stored))) as kept:
+        listening = should_stop, tell, lambda stored: log(Committed(stored))
+        with patient_store(store, recorder, *listening, told or dict) as kept:
             counts = (lambda: DispatchCounts(workers=1)) if engine is None else lambda: engine.counts
             session = driver.run(search, kept, state, after_generation, tell_failed, counts)
             state, reason = (yield from session) if engine is None else driver.drive(session, engine)

@@ -39,7 +39,7 @@ from es_service.runs.certified import (
 from es_service.runs.checked_config import accepted, columns, require_resumable
 from es_service.runs.evaluation import candidates
 from es_service.runs.selection import StoredEpisodes, new_episodes
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, Told, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free
 from es_service.runs.worker_count import require_cores
@@ -202,8 +202,13 @@ class Listener:
     on_compile: OnNotice
     on_output: OnNotice
     hook: Callable[[str], None] = no_hook
-    asks_caller: bool = False
-    """Whether the caller computes the episodes, to whom the sessions yield their work."""
+    told: Told | None = None
+    """Metrics of the caller, if it computes the episodes, so that the sessions yield their work to it."""
+
+    @property
+    def asks_caller(self) -> bool:
+        """Whether the caller computes the episodes."""
+        return self.told is not None
 
 
 def create_run(
@@ -244,8 +249,8 @@ def create_run(
         begun = store.generation
         try:
             until = until_due(on_generation, due(folder, config))
-            told = listener.on_notice, listener.on_compile, listener.on_output
-            outcome = yield from work(config, store, until, *told, asks_caller=listener.asks_caller)
+            listening = listener.on_notice, listener.on_compile, listener.on_output
+            outcome = yield from work(config, store, until, *listening, told=listener.told)
         except StartError as error:
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations
@@ -326,6 +331,6 @@ def _session(
             return config, Outcome(open_run(folder), TO_CERTIFY, is_finished=False)
         with listener.shown(folder) as on_generation:
             until = until_due(on_generation, is_due)
-            told = listener.on_notice, listener.on_compile, listener.on_output
-            outcome = yield from work(config, store, until, *told, strict=strict, asks_caller=listener.asks_caller)
+            listening = listener.on_notice, listener.on_compile, listener.on_output
+            outcome = yield from work(config, store, until, *listening, strict=strict, told=listener.told)
             return config, outcome

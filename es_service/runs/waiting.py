@@ -33,6 +33,7 @@ AGAIN_S = 0.5
 """Least seconds between two attempts to store what waits in memory."""
 
 Result = TypeVar("Result")
+_Generation = tuple[int, Changes, HistoryRow, Table, Contents, Mapping[str, float]]
 
 
 def when_free(act: Callable[[], Result], held: Callable[[], object]) -> Result:
@@ -66,11 +67,14 @@ class PatientStore:
         should_stop: Callable[[], int | None],
         tell: Callable[[str], None],
         on_commit: Callable[[int], object],
+        told: Callable[[], Mapping[str, float]],
     ) -> None:
-        """Hold nothing yet. `on_commit` is called with each generation that has been committed; `tell` with notices."""
+        """Hold nothing yet. `on_commit` is called with each generation that has been committed; `tell` with notices;
+        `told` returns the metrics that the transaction of a generation has with it."""
         self._store, self._recorder = store, recorder
         self._should_stop, self._tell, self._on_commit = should_stop, tell, on_commit
-        self._waiting: deque[tuple[int, frozenset[str], tuple[int, Changes, HistoryRow, Table, Contents]]] = deque()
+        self._metrics_told = told
+        self._waiting: deque[tuple[int, frozenset[str], _Generation]] = deque()
         self._metrics: dict[int, Mapping[str, float]] = {}
         self._bytes, self._again_s, self._is_held = 0, 0.0, False
         self.has_failed = False
@@ -83,7 +87,7 @@ class PatientStore:
         Raises:
             Interrupted: a stop was requested while it could not be read. Otherwise as `RunStore.content`.
         """
-        for _, _, (*_, contents) in self._waiting:
+        for _, _, (*_, contents, _) in self._waiting:
             if name in contents:
                 return contents[name]
         return when_free(partial(self._store.content, name), self._pause)
@@ -101,7 +105,8 @@ class PatientStore:
         arrays = [array for part in given if part is not None for array in part.values()]
         size = sum(array.nbytes for array in arrays)
         is_first = not self._waiting
-        self._waiting.append((size, self._recorder.workers(), (generation, parts, history, evaluations, contents)))
+        taken = generation, parts, history, evaluations, contents, self._metrics_told()
+        self._waiting.append((size, self._recorder.workers(), taken))
         self._bytes += size
         if is_first or time.monotonic() >= self._again_s:
             self.store_waiting(PATIENCE_S if is_first else 0.0)
@@ -199,6 +204,7 @@ def patient_store(
     should_stop: Callable[[], int | None],
     tell: Callable[[str], None],
     on_commit: Callable[[int], object],
+    told: Callable[[], Mapping[str, float]] = dict,
 ) -> Iterator[PatientStore]:
     """Context manager with the store for a session, after which everything is stored, however long that takes.
 
@@ -206,7 +212,7 @@ def patient_store(
         DatabaseHeldError: the session was interrupted, and another program still holds the database. If another error
             ends the session, that is raised, and a notice says what could not be stored.
     """
-    patient = PatientStore(store, recorder, should_stop, tell, on_commit)
+    patient = PatientStore(store, recorder, should_stop, tell, on_commit, told)
     try:
         yield patient
         patient.finish()

@@ -170,6 +170,7 @@ class RunStore:
         history: Values,
         evaluations: Table = NO_ROWS,
         contents: Mapping[bytes, Part] = MappingProxyType({}),
+        recorded: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
@@ -179,6 +180,7 @@ class RunStore:
             history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
             evaluations: likewise for the centres that the generation evaluated, in the order of the asks: a table.
             contents: contents by name, among them those that the parts name and that are not stored yet.
+            recorded: metrics that a caller has told, by name; they are no columns.
 
         Raises:
             DatabaseHeldError: another program holds the database. StoreError: the generation is not the next one, the
@@ -205,6 +207,8 @@ class RunStore:
             insert_contents(connection, ((name, contents[name]) for name in added))
             self._hook("mid_transaction")
             insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
+            if recorded:
+                metrics.record(connection, generation, recorded)
             if self._recorded:
                 store_list(connection)
             self._hook("before_commit")

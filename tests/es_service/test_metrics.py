@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import sqlite3
+import subprocess
 import sys
 from contextlib import closing
 from dataclasses import replace
@@ -14,6 +16,8 @@ import pytest
 from es_service import Stop, api, ask_tell, write_comparison, write_report
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.messages import HostChoices
+from es_service.report.data import read_run
+from es_service.report.series import charts
 from es_service.runs.export import export
 from es_service.runs.tracking import TensorBoard, tracked
 from es_service.store.folder import DATABASE
@@ -212,6 +216,9 @@ def test_what_a_program_records_is_a_curve_and_a_measure_of_groups(tmp_path):
             folders.append(api.run(config, tmp_path / f"{sigma}_{seed}", on_generation=record).run.folder)
     write_report(folders[0], tmp_path / "report.html")
     assert "of the program that ran the session" in (tmp_path / "report.html").read_text()
+    alone = read_run(folders[0])
+    [curve] = [chart for chart in charts(alone.history, alone.centres, 0.0) if chart.title == "loss"]
+    np.testing.assert_array_equal(curve.lines[0].y_K, [np.nan, np.nan, 0.0, np.nan])  # no value is no point
     write_comparison(folders, tmp_path / "both.html", statistics=tmp_path / "both.json")
     [loss] = [one for one in json.loads((tmp_path / "both.json").read_text()) if one["name"] == "metric_loss"]
     assert [average["median"] for average in loss["averages"]] == [0.5, 10.5], "a value holds until the next one"
@@ -247,15 +254,48 @@ def test_a_wrong_metric_of_a_program_ends_the_session_and_names_it(tmp_path, giv
     assert api.open_run(tmp_path / "run").generation == 0
 
 
-def test_who_asks_and_tells_records_numbers_of_the_generation(tmp_path):
+def asks_and_tells(folder):
+    """The run of a caller who records the number of each generation."""
     config = changed(environment="caller", options={"parameters": 3}) | {"map": {"enabled": False}}
     config |= {"search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 1}}
-    with ask_tell(config, tmp_path / "run") as search:
+    with ask_tell(config, folder) as search:
         while (asked := search.ask()) is not None:
             generation = float(asked.token.generation)
             search.tell(asked, -np.square(asked.parameters).sum(axis=1), metrics={"loss": generation})
-        history = search.run.history
+        return search.run
+
+
+def test_who_asks_and_tells_records_numbers_of_the_generation(tmp_path):
+    history = asks_and_tells(tmp_path / "run").history
     assert history.metric_loss.tolist() == history.index.tolist() == [0, 1, 2, 3]
+
+
+KILLED_AFTER_A_COMMIT = """
+import os, signal, sys
+from pathlib import Path
+from es_service.store.writer import RunStore
+from tests.es_service.test_metrics import asks_and_tells
+
+commit = RunStore.commit
+
+def and_die(store, generation, *given):
+    commit(store, generation, *given)
+    if generation == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+RunStore.commit = and_die
+asks_and_tells(Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.slow
+def test_what_a_caller_tells_is_in_the_transaction_of_its_generation(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", KILLED_AFTER_A_COMMIT, tmp_path / "run"], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert [row["metric_loss"] for row in read_history(tmp_path / "run")] == [0.0, 1.0, 2.0]
+    run = asks_and_tells(tmp_path / "run")
+    assert run.history.metric_loss.tolist() == [0, 1, 2, 3]
+    assert run.digest() == asks_and_tells(tmp_path / "whole").digest()
 
 
 @pytest.mark.parametrize("damage", ["'{\"loss\": 9.0}'", "CAST(X'FF' AS TEXT)"])
