@@ -36,7 +36,8 @@ from es_service.cli.common import (
     print_note,
 )
 from es_service.cli.status import print_certified, print_summary
-from es_service.errors import Interrupted, RunLockedError, ServiceError, WayOut
+from es_service.cli.sweep import ParallelOption, SeedsOption, polish_goals
+from es_service.errors import ConfigError, Interrupted, RunLockedError, ServiceError, WayOut
 from es_service.loop.history import Row
 from es_service.protocol.user_code import users_error
 from es_service.report.progress import ShowNotice, ShowRow, print_notice, show_progress
@@ -130,6 +131,16 @@ def polish(
     candidates: Annotated[
         int | None, typer.Option("--candidates", min=1, help="Policies that are left after the first evaluation.")
     ] = None,
+    goals: Annotated[
+        str | None,
+        typer.Option(
+            "--goals",
+            metavar="all | A,B",
+            help="A run for each of these goals of the task, which share the budget and the cores.",
+        ),
+    ] = None,
+    seeds: SeedsOption = None,
+    parallel: ParallelOption = None,
     set_: SetOption = None,
     out: OutOption = None,
     seed: SeedOption = None,
@@ -145,6 +156,15 @@ def polish(
 
     chosen = [] if candidates is None else [f"search.candidates={candidates}"]
     wanted = overrides([*chosen, *(set_ or ())], seed=seed, workers=workers, engine=engine, address=address)
+    if goals is not None:
+        if out is None or show_output:
+            what = "needs --out FOLDER, in which each goal has a run" if out is None else "does not show output"
+            raise ConfigError(f"--goals {goals} {what}", field="goals", value=goals)
+        polish_goals(parent, goals, out, wanted, seeds, parallel, log, log_level)
+        return
+    for option, value in {"--seeds": seeds, "--parallel": parallel}.items():
+        if value is not None:
+            raise ConfigError(f"{option} {value} needs --goals; add it, or leave {option} out", field=option)
     config = polish_config(parent, wanted)
     folder = out if out is not None else api.default_folder(config)
     told = partial(print_notice, errors), output_shown(show_output)

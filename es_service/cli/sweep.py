@@ -62,6 +62,8 @@ ParallelOption = Annotated[
     int | None,
     typer.Option("--parallel", min=1, help="Runs at a time, which share the cores; default: one per core."),
 ]
+GOALS, HELD = "goals.csv", 0.5
+"""The file with a row for each goal, and the share of episodes from which a policy counts as one that reaches it."""
 
 
 def sweep(
@@ -135,6 +137,42 @@ def run_seeds(
     run_sweep(labelled([config], ()), folder, wanted, {}, seeds, None, options, as_json=as_json)
 
 
+def polish_goals(
+    parent: Path,
+    goals: str,
+    out: Path,
+    wanted: Sequence[str],
+    seeds: str | None,
+    parallel: int | None,
+    trackers: list[str] | None,
+    log_level: str | None,
+) -> None:
+    """`polish --goals`: a run for each goal and seed, which are certified, and a table of what their policies do."""
+    from es_service.runs.goals import goal_configs
+
+    configs = goal_configs(parent, [name.strip() for name in goals.split(",")], wanted)
+    options = _options_of_each(trackers, log_level)
+    run_sweep(configs, out, wanted, {}, seeds, parallel, options, Certifying(), as_json=False, shows=_show_goals)
+
+
+def _show_goals(runs: Sequence[SweptRun], out: Path) -> None:
+    """Print what the certified policy of each goal does, and write it to a file."""
+    from es_service.runs.goals import goals_reached
+
+    reached = goals_reached(run.folder for run in runs if run.row is not None)
+    if reached.empty:
+        return
+    for row in reached.to_dict("records"):
+        share, low, high = (row[name] for name in ("success", "success_low", "success_high"))
+        reaches = f"{share:.0%} of {row['episodes']} episodes succeed ({low:.0%} to {high:.0%})"
+        value = reaches if row["episodes"] else "not certified"
+        print_line(console, f"goal {row['goal']}, seed {row['seed']}: {value}, after {row['env_steps']:,} steps")
+    held = int((reached.success >= HELD).sum())
+    print_line(console, f"{held} of {len(reached)} policies succeed in at least half of their episodes")
+    reached.to_csv(out / GOALS, index=False)
+    print(out / GOALS)
+
+
 def _options_of_each(trackers: list[str] | None, log_level: str | None) -> list[str]:
     """Options of this command that its runs get. Raises ConfigError if a tracker cannot be used."""
     check_trackers(trackers or ())
@@ -166,11 +204,13 @@ def run_sweep(
     bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     *,
     as_json: bool,
+    shows: Callable[[Sequence[SweptRun], Path], object] | None = None,
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed.
 
     Args:
         bounds: as of `write_comparison`.
+        shows: called with the runs and `out` in place of the comparison.
         as_json: whether to print a line of JSON for each run that has changed, and one for the comparison.
     """
     planned = plan(configs, out, grid, None if seeds is None else seeds_of(seeds), wanted)
@@ -188,7 +228,10 @@ def run_sweep(
             f"--out {shlex.quote(str(out))}, continues"
         )
         raise
-    _compare(runs, out, bounds, (lambda file: print_json_line({"report": str(file)})) if as_json else print)
+    if shows is not None:
+        shows(runs, out)
+    else:
+        _compare(runs, out, bounds, (lambda file: print_json_line({"report": str(file)})) if as_json else print)
     for run in runs:
         if run.state == "stopped":
             print_note(f"{run.name} is not finished: {run.reason}. Raise budget.wall_clock_s")

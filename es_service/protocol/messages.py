@@ -72,6 +72,11 @@ class TaskSpec:
     """Least distance between a descriptor and the middle line of a wall."""
     goal: tuple[float, float] | None = None
     """Place of the goal, if the descriptor is a position in the plane; shown in reports. None if there is none."""
+    goals: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Values of the option `goal` with which every episode has the same goal -> the descriptor of an episode that ends
+    there."""
+    goal_radius: float = 0.0
+    """Distance from such a goal within which an episode has reached it."""
     least_reward: float | None = None
     """Reward per step from which a QD-score counts: about the least mean reward of an episode. It is not always a
     lower bound: short episodes of AntTrap can be below it. None if it is not specified."""
@@ -120,12 +125,13 @@ NO_CHOICES = HostChoices()
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:
-    """The task with the descriptor that its option `descriptor` chooses; unchanged if `options` choose none."""
-    chosen = options.get("descriptor")
-    if not isinstance(chosen, str) or chosen not in task.descriptors:
-        return task
-    names, bounds = task.descriptors[chosen]
-    return replace(task, descriptor_names=names, descriptor_bounds=bounds)
+    """The task with the descriptor and the goal that its options `descriptor` and `goal` choose."""
+    chosen, goal = options.get("descriptor"), options.get("goal")
+    if isinstance(chosen, str) and chosen in task.descriptors:
+        names, bounds = task.descriptors[chosen]
+        task = replace(task, descriptor_names=names, descriptor_bounds=bounds)
+    place = task.goals.get(goal, ()) if isinstance(goal, str) else ()
+    return replace(task, goal=(place[0], place[1])) if len(place) == 2 else task
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from numpy.typing import ArrayLike
 
 from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
+from es_service.config.parts import TargetObjective
+from es_service.config.search import CandidatesConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, NotInRunError, StoreError
@@ -94,7 +96,7 @@ def certify_run(
         generation: one whose state the run keeps, from which the candidates are taken; None: the newest.
         episodes: number of certification episodes of each policy that remains.
         keep: number of policies that remain after selection.
-        by: what selection ranks by; None: what the run's `task.fitness` says. Equal ones rank by their return, and then
+        by: what selection ranks by; None: what `default_measure` says. Equal ones rank by their return, and then
             in the order of the candidates.
         task: name of the other task; None: none.
         overrides: its options, such as "task.options.frame_skip=5"; see `other_task`.
@@ -320,4 +322,11 @@ def _measure(config: RunConfig, by: RankedBy | None) -> RankedBy:
             value=by,
             allowed=", ".join(allowed),
         )
-    return by or measure_of(config.task.fitness)
+    return by or default_measure(config)
+
+
+def default_measure(config: RunConfig) -> RankedBy:
+    """What policies of a run are selected by: success if it polishes for a target set in a task that declares success,
+    else what its `task.fitness` says."""
+    has_target = isinstance(config.search, CandidatesConfig) and isinstance(config.search.objective, TargetObjective)
+    return "success" if has_target and task_of(config).success else measure_of(config.task.fitness)

@@ -24,8 +24,8 @@ from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, na
 from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Policy
 from es_service.protocol.messages import Moments
-from es_service.runs.certification import certify_run
-from es_service.runs.certified import EPISODES, Certified, certified_policies, measure_of
+from es_service.runs.certification import certify_run, default_measure
+from es_service.runs.certified import EPISODES, Certified, certified_policies
 from es_service.runs.checked_config import changed_config, changes_from, load_config
 from es_service.runs.snapshot import Snapshot
 from es_service.runs.view import Run, named_best, named_by_all, open_run
@@ -301,17 +301,24 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
     Raises:
         ConfigError: lists every problem found. NotInRunError: the run has no finished generation.
     """
-    run = open_run(parent)
+    overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
+    return load_config(polish_source(open_run(parent), overrides), overrides, name=str(open_run(parent).config_file))
+
+
+def polish_source(run: Run, overrides: Overrides, share: int = 1) -> dict[str, Any]:
+    """What `polish_config` loads, before the overrides.
+
+    Args:
+        share: number of runs that have the budget in equal shares.
+    """
     if run.generation is None:
         raise NotInRunError(f"{run.folder} has no finished generation yet, and so no policies", run=run.folder)
     present = run.present_config
     sections = {name: present[name] for name in ("task", "policy", "map", "seed")}
     steps = int(run.history_rows(run.generation)[-1]["env_steps"])
     search = {"algorithm": METHOD, "init_from": str(run.folder)}
-    overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
     is_limited = any(parse_overrides(overrides)[0].get(f"budget.{name}") is not None for name in LIMITS)
-    budget = {} if is_limited else {"env_steps": steps}
-    return load_config({**sections, "search": search, "budget": budget}, overrides, name=str(run.config_file))
+    return {**sections, "search": search, "budget": {} if is_limited else {"env_steps": -(-steps // share)}}
 
 
 def certified_for(
@@ -327,8 +334,6 @@ def certified_for(
     which none has decided that the run is over, and selected by the same measure before and after. What is not
     certified so is certified now.
 
-    With a target set in a task that declares success, policies are selected by success.
-
     Args:
         config: that of the run that polishes.
         centre: whether the newest centre is a candidate, too.
@@ -336,10 +341,7 @@ def certified_for(
     Raises:
         RunLockedError: a driver writes to the run. Otherwise as `certify_run`.
     """
-    search, by = config.search, measure_of(config.task.fitness)
-    has_target = isinstance(search, CandidatesConfig) and isinstance(search.objective, TargetObjective)
-    if has_target and task_of(config).success:
-        by = "success"
+    by = default_measure(config)
     certified = [
         policy
         for policy in certified_policies(run.folder)

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from es_service.errors import counted
 from es_service.protocol.messages import UNBOUNDED, Bounds, DescriptorChoice, TaskKind, TaskSpec
-from es_service.protocol.options import Option, OptionValue
+from es_service.protocol.options import Option, OptionValue, declared_options
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.protocol.user_code import import_user_module, in_no_file, users_error, why_not_imported
 from workers.environments import TaskError
@@ -90,7 +91,7 @@ def construct(task: Any, options: Mapping[str, OptionValue]) -> Any:
         ) from None
 
 
-KEPT_ATTRIBUTES = ("walls", "wall_clearance", "goal", "least_reward", "final_fitness", "metric_names")
+KEPT_ATTRIBUTES = ("walls", "wall_clearance", "goal", "goals", "goal_radius", "least_reward", "final_fitness", "metric_names")
 """What a class of any kind may declare as attributes, which a constructor must not change, since a run takes them from
 the class."""
 OF_EVERY_CLASS = (*KEPT_ATTRIBUTES, "options", "goal_distance", "success", "metrics")
@@ -157,7 +158,9 @@ def wrong_values(task: Any, names: Any, bounds: Any, sizes: tuple[str, ...]) -> 
     goal = getattr(task, "goal", None)
     if goal is not None and not (are_finite(goal) and len(goal) == 2):
         wrong.append(f"goal = {goal!r} is not a place (x, y) of finite numbers")
+    wrong += _wrong_goals(task, len(names))
     numbers = {
+        "goal_radius": getattr(task, "goal_radius", 0.0),
         "wall_clearance": getattr(task, "wall_clearance", 0.0),
         "least_reward": 0.0 if least is None else least,
     }
@@ -190,11 +193,30 @@ def task_of_class(
         walls=getattr(task, "walls", None),
         wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
         goal=getattr(task, "goal", None),
+        goals={name: tuple(map(float, place)) for name, place in getattr(task, "goals", {}).items()},
+        goal_radius=float(getattr(task, "goal_radius", 0.0)),
         least_reward=getattr(task, "least_reward", None),
         success=_success_in_words(task),
         kind=kind,
         metric_names=tuple(getattr(task, "metric_names", ())),
     )
+
+
+def _wrong_goals(task: Any, size: int) -> list[str]:
+    """Problems of the goals that a class declares for `polish --goals`.
+
+    Args:
+        size: number of dimensions of the descriptor.
+    """
+    goals: Any = getattr(task, "goals", {})
+    if not isinstance(goals, Mapping) or not all(are_finite(place) and len(place) == size for place in goals.values()):
+        return [f"goals = {goals!r} is not a mapping from names to places of {counted(size, 'finite number')} each"]
+    option = declared_options(task)[0].get("goal")
+    lacking = [name for name in goals if option is None or name not in option.choices]
+    wrong = [f"goals has {', '.join(map(str, lacking))}, which the option goal cannot be"] if lacking else []
+    if goals and not getattr(task, "goal_radius", 0.0) > 0.0:
+        wrong.append("goals needs goal_radius, the distance within which an episode has reached its goal, above 0")
+    return wrong
 
 
 def wrong_metrics(task: Any) -> list[str]:

@@ -45,13 +45,15 @@ class GoalState(NamedTuple):
     """Where the goal of the episode is, in metres."""
 
 
-def make(maze: str, goal: str = DRAWN, reward: str = "at_goal") -> Environment:
+def make(maze: str, goal: str = DRAWN, reward: str = "at_goal", observation: str = "with_goal") -> Environment:
     """Functions of a maze.
 
     Args:
         maze: the name of the task.
         goal: `drawn`, or the goal of every episode, ROW-COLUMN.
         reward: `at_goal`, 1 for each step that ends within 0.5 m of the goal, else 0; or `dense`.
+        observation: `with_goal`, or `without_goal`, which has zeros in its place: a policy of an archive, which is for
+            one goal, then acts the same whatever the goal of the episode is.
     """
     ant = make_ant(walls_of(maze), near=WALLS_MET)
     goals = goals_of(maze)
@@ -71,6 +73,8 @@ def make(maze: str, goal: str = DRAWN, reward: str = "at_goal") -> Environment:
 
     def observe_all(state: GoalState) -> Any:
         here_2, goal_2 = ((xy - middle_2) / half_2 for xy in (state.ant.q[:2], state.goal_2))
+        if observation == "without_goal":
+            goal_2 = jnp.zeros_like(goal_2)
         return jnp.concatenate([here_2, observe(state.ant), goal_2])
 
     def step(state: GoalState, action: Any) -> tuple[GoalState, Any, Any]:
