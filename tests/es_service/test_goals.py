@@ -24,7 +24,7 @@ class Line:
     observation_size, action_size, episode_steps = 1, 1, 20
     descriptor_names, descriptor_bounds = ("x",), ((-0.2, 0.2),)
     options = {"goal": ("none", "left", "right")}  # noqa: RUF012
-    goals, goal_radius = {"left": (-0.15,), "right": (0.15,)}, 0.05  # noqa: RUF012
+    goals, goal_radius = {"left": (-0.15,), "right": (0.15,)}, 0.05
 
     def __init__(self, goal="none"):
         self._goal = self.goals.get(goal, (0.0,))[0]
@@ -134,9 +134,7 @@ def test_options_that_need_goals_or_do_not_fit_them_are_refused(parent, words, s
 )
 def test_goals_that_a_class_declares_wrongly_are_refused(changes, sentence):
     task = type("Wrong", (Line,), changes)
-    assert any(
-        sentence in problem for problem in wrong_values(task, task.descriptor_names, task.descriptor_bounds, ())
-    )
+    assert any(sentence in problem for problem in wrong_values(task, task.descriptor_names, task.descriptor_bounds, ()))
     assert not wrong_values(Line, Line.descriptor_names, Line.descriptor_bounds, ())
 
 

@@ -91,7 +91,16 @@ def construct(task: Any, options: Mapping[str, OptionValue]) -> Any:
         ) from None
 
 
-KEPT_ATTRIBUTES = ("walls", "wall_clearance", "goal", "goals", "goal_radius", "least_reward", "final_fitness", "metric_names")
+KEPT_ATTRIBUTES = (
+    "walls",
+    "wall_clearance",
+    "goal",
+    "goals",
+    "goal_radius",
+    "least_reward",
+    "final_fitness",
+    "metric_names",
+)
 """What a class of any kind may declare as attributes, which a constructor must not change, since a run takes them from
 the class."""
 OF_EVERY_CLASS = (*KEPT_ATTRIBUTES, "options", "goal_distance", "success", "metrics")
