@@ -45,8 +45,8 @@ def goal_configs(
     task = task_of(changed_config(run.present_config, name=str(run.config_file)))
     if not task.goals:
         raise ConfigError(
-            f"{task.name} has no goals to choose from; search.objective has one target set: --set "
-            "search.objective.kind=target --set 'search.objective.descriptor=[...]'",
+            f"{task.name} declares no goals; to polish for one place, set search.objective.kind = target and "
+            "search.objective.descriptor",
             field="goals",
             value=list(goals),
             run=run.folder,

@@ -84,7 +84,7 @@ def test_unknown_goals_and_tasks_without_goals_are_refused(parent, tmp_path):
         goal_configs(parent.folder, ["rihgt"])
     maze = load_config({"task": {"environment": "point_maze"}, "search": {"algorithm": "es", "pairs": 16},
                         "budget": {"generations": 1}, "compute": {"workers": 1, "engine": "inline"}})  # fmt: skip
-    with pytest.raises(ConfigError, match=r"point_maze has no goals .* search\.objective\.kind=target"):
+    with pytest.raises(ConfigError, match=r"point_maze declares no goals; .* search\.objective\.kind = target"):
         goal_configs(run(maze, tmp_path / "maze").run.folder)
 
 
@@ -124,7 +124,7 @@ def test_options_that_need_goals_or_do_not_fit_them_are_refused(parent, words, s
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"goals": {"left": (0.1, 0.2)}}, "places of 1 finite number each"),
+        ({"goals": {"left": (0.1, 0.2)}}, "tuples of finite numbers, 1 in each"),
         ({"goals": ["left"]}, "is not a mapping"),
         ({"goals": {"up": (0.1,)}}, "goals has up, which the option goal cannot be"),
         ({"options": {}}, "goals has left, right, which the option goal cannot be"),

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from es_service.errors import counted
 from es_service.protocol.messages import UNBOUNDED, Bounds, DescriptorChoice, TaskKind, TaskSpec
 from es_service.protocol.options import Option, OptionValue, declared_options
 from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
@@ -219,7 +218,7 @@ def _wrong_goals(task: Any, size: int) -> list[str]:
     """
     goals: Any = getattr(task, "goals", {})
     if not isinstance(goals, Mapping) or not all(are_finite(place) and len(place) == size for place in goals.values()):
-        return [f"goals = {goals!r} is not a mapping from names to places of {counted(size, 'finite number')} each"]
+        return [f"goals = {goals!r} is not a mapping from names to tuples of finite numbers, {size} in each"]
     option = declared_options(task)[0].get("goal")
     lacking = [name for name in goals if option is None or name not in option.choices]
     wrong = [f"goals has {', '.join(map(str, lacking))}, which the option goal cannot be"] if lacking else []
