@@ -35,17 +35,17 @@ from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
     Centre,
-    Chunk,
     ChunkResult,
     EpisodesResult,
     GradientChunk,
     TrainingChunk,
     Work,
-    WorkerPlace,
     WorkerSpec,
     evaluation_chunks,
 )
 from es_service.protocol.policies import Policies
+from es_service.protocol.recipes import Recipes
+from es_service.protocol.sent import Received
 from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
@@ -53,8 +53,11 @@ from es_service.search.novelty import extended
 from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
+from workers.actor import WorkerActor
+from workers.compilable import Compilable
 from workers.cores import parts
 from workers.policies.policy import initial_parameters
+from workers.reports import Reports
 
 MEASURE_S = 1.0
 """Time for the measurement of each kind of chunk."""
@@ -191,31 +194,22 @@ class _EchoSpec(WorkerSpec):
     """Answer of each kind of chunk."""
 
 
-class EchoActor:
-    """In the place of a worker's actor: it computes for SPIN_S and gives each chunk the recorded answer of its kind."""
-
-    def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
-        self._answers: dict[str, ChunkResult] = pickle.loads(spec).answers
-
-    def place(self) -> WorkerPlace:
-        """As `WorkerActor.place`."""
-        return WorkerPlace("", 0, "")
+class EchoActor(WorkerActor):
+    """A worker that computes for SPIN_S and gives each chunk the recorded answer of its kind."""
 
     def build(self) -> str:
-        """As `WorkerActor.build`."""
+        """As `WorkerActor.build`, without the code of a task."""
+        spec: _EchoSpec = pickle.loads(self._spec)
+
+        def echo(work: Sequence[Work]) -> list[ChunkResult]:
+            until = time.perf_counter() + SPIN_S
+            while time.perf_counter() < until:
+                pass
+            return [spec.answers[_kind(one)] for one in work]
+
+        self._received, self._reports = Received(spec.parent_cache_bytes, Recipes.made), Reports(spec, self._cores)
+        self._run_chunks = Compilable(echo, lambda work: None)
         return platform_text({})
-
-    def compile(self, chunks: bytes, *centres: bytes) -> float:
-        """As `WorkerActor.compile`."""
-        return 0.0
-
-    def run(self, chunks: bytes, *centres: bytes) -> bytes:
-        """As `WorkerActor.run`."""
-        until = time.perf_counter() + SPIN_S
-        asked: list[tuple[int, Chunk]] = pickle.loads(chunks)[1]
-        while time.perf_counter() < until:
-            pass
-        return pickle.dumps([self._answers[type(chunk).__name__] for _, chunk in asked], pickle.HIGHEST_PROTOCOL)
 
 
 def _message_costs(
