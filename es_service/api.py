@@ -24,7 +24,7 @@ from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, show_notice
 from es_service.runs.sessions import Listener, continue_run, create_run, outcome_of
 from es_service.runs.view import Run, open_run
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.folder import CONFIG, holds_run
 from es_service.store.writer import RunStore, no_hook
 

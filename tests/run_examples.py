@@ -21,7 +21,7 @@ from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.maps.geometry import Geometry, Grid, make_geometry
 from es_service.search.novelty import archive_of
 from es_service.search.steps import fresh_state
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from tests.es_service.config_examples import load_config

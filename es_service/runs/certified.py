@@ -30,9 +30,9 @@ from es_service.runs.selection import (
     share_gap_interval,
 )
 from es_service.runs.snapshot import policy_spec, sizes_of
-from es_service.store.certifications import CertifiedRow
 from es_service.store.facts import Damaged, Form, require_form
 from es_service.store.reader import read_certifications, read_meta
+from es_service.store.records import CertifiedRow
 from es_service.store.schema import RunMeta
 
 EPISODES = 256

@@ -37,9 +37,9 @@ from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.novelty import sound_archive
 from es_service.search.steps import fresh_state
 from es_service.store import reader
-from es_service.store.beginning import SEVERAL, Beginning
-from es_service.store.certifications import CERTIFICATIONS
+from es_service.store.create import SEVERAL, Beginning
 from es_service.store.digest import digest_at
+from es_service.store.records import CERTIFICATIONS
 
 NORMALISED = "policy.observation_normalization"
 OBSERVED = ("policy.observation_clip", NORMALISED)

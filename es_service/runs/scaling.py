@@ -50,7 +50,7 @@ from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
 from es_service.search.novelty import extended
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor

@@ -41,8 +41,8 @@ from es_service.runs.snapshot import require_sound_state
 from es_service.runs.view import Run, open_run
 from es_service.runs.waiting import patient_store
 from es_service.search.algorithms import ALGORITHMS
-from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
+from es_service.store.create import SEVERAL
 from es_service.store.lock import RunLock
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore

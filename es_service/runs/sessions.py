@@ -43,8 +43,7 @@ from es_service.runs.session import OnGeneration, OnNotice, Outcome, Told, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free
 from es_service.runs.worker_count import require_cores
-from es_service.store.beginning import Beginning
-from es_service.store.create import remove_run_folder
+from es_service.store.create import Beginning, remove_run_folder
 from es_service.store.folder import CONFIG, explained, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook

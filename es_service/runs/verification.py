@@ -39,9 +39,8 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
 from es_service.store.codec import changed_sum, encode_changes, rows_listed, state_sha256, state_sum, stored_values
 from es_service.store.lock import require_unlocked
-from es_service.store.rows import HistoryRow as StoredRow
+from es_service.store.rows import StoredRow, table_bytes
 from es_service.store.states import KeptRows, rows_in_force
-from es_service.store.tables import table_bytes
 from workers.environments import settings_of_description
 
 

@@ -40,8 +40,8 @@ from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.folder import CONFIG
+from es_service.store.rows import Columns
 from es_service.store.schema import RunMeta
-from es_service.store.tables import Columns
 
 if TYPE_CHECKING:
     import pandas as pd

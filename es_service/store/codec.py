@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 from pydantic import Field, StringConstraints
 
 from es_service.errors import StoreError
-from es_service.loop.history import NO_INTEGER, Column
+from es_service.loop.history import NO_INTEGER, Column, Row
 from es_service.protocol.content import NAME
 from es_service.store.facts import Damaged, facts
 
 Part = Mapping[str, NDArray[Any]]
 """A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
-Row = tuple[int | float | None, ...]
+RowValues = tuple[int | float | None, ...]
 """Values of one history row in the order of the run's columns; None stands for no value."""
-Values = Mapping[str, int | float | None]
-"""The same by the names of the columns; NaN or None stands for no value."""
 StateRow = tuple[str, int, str, bytes]
 """A state row: its part, its generation, its SHA-256 and its payload."""
 ListedRows = Mapping[str, tuple[int, str]]
@@ -155,7 +153,7 @@ def text_sha256(key: str, text: str) -> str:
     return hashlib.sha256(f"{key}\0{text}".encode()).hexdigest()
 
 
-def row_values(columns: Sequence[Column], generation: int, history: Values) -> Row:
+def row_values(columns: Sequence[Column], generation: int, history: Row) -> RowValues:
     """Values of a history row as they are stored: NaN becomes None, and -0.0 becomes 0.0, as in SQLite.
 
     Args:
@@ -179,7 +177,7 @@ def row_values(columns: Sequence[Column], generation: int, history: Values) -> R
     return stored_values(columns, given)
 
 
-def stored_values(columns: Sequence[Column], given: Values) -> Row:
+def stored_values(columns: Sequence[Column], given: Row) -> RowValues:
     """The values of `columns` as they are stored; a column that is not given has no value. Raises StoreError for a
     value of the wrong type."""
     return tuple(_stored_value(column, given.get(column.name)) for column in columns)
@@ -199,7 +197,7 @@ def _stored_value(column: Column, value: Any) -> int | float | None:
     return integer
 
 
-def row_bytes(row: Row) -> bytes:
+def row_bytes(row: RowValues) -> bytes:
     """Bytes of the values of a row, for its SHA-256. Raises ValueError for a value that is not a number."""
     parts: list[bytes] = []
     for value in row:
@@ -219,12 +217,12 @@ def column_bytes(columns: Sequence[Column]) -> bytes:
     return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
 
 
-def row_sha256(columns: bytes, row: Row, evaluations: bytes, state: str) -> str:
+def row_sha256(columns: bytes, row: RowValues, evaluations: bytes, state: str) -> str:
     """SHA-256 of a history row: of its columns (`column_bytes`), its values, and the `state_sha256` and the evaluated
     centres stored with it."""
     return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode(), evaluations))).hexdigest()
 
 
-def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:
+def row_dict(columns: Sequence[Column], row: RowValues) -> dict[str, int | float]:
     """Values of a stored row by column name; NaN stands for no value."""
     return {column.name: math.nan if value is None else value for column, value in zip(columns, row, strict=True)}

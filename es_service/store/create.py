@@ -1,15 +1,33 @@
-"""Creation of a run folder, which appears complete or not at all, even if the process is killed."""
+"""Creation of a run folder, which appears complete or not at all, even if the process is killed.
+
+A fork begins with the history and the state of its parent. A run that starts from the centre of another run stores this
+centre, so later changes of the other run have no effect on it.
+"""
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import os
 import sqlite3
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from es_service.errors import StoreError, WayOut
-from es_service.store.beginning import Beginning, store_beginning
+from es_service.loop.history import Row
+from es_service.store.codec import (
+    Part,
+    encode_changes,
+    encode_part,
+    row_bytes,
+    rows_listed,
+    state_sha256,
+    state_sum,
+    stored_values,
+)
 from es_service.store.folder import (
     CONFIG,
     COPY,
@@ -22,8 +40,66 @@ from es_service.store.folder import (
     write_config,
 )
 from es_service.store.lock import RunLock, acquire_lock
+from es_service.store.records import START, metric_values, record_metrics, record_platform
 from es_service.store.repair import connect
-from es_service.store.schema import RunMeta, create_tables
+from es_service.store.rows import insert_history
+from es_service.store.schema import RunMeta, create_tables, put_meta
+from es_service.store.states import insert_contents, insert_state
+
+SEVERAL = "centre_K_D"
+"""Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Data with which a run begins; empty for an ordinary run."""
+
+    history: Iterable[Row] = ()
+    """History rows of a fork's parent, of generations 0 to `newest`. They are iterated over once and need not fit into
+    memory. Columns that this run does not have are left out; columns that the parent does not have get no value."""
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    """State of the parent at generation `newest`."""
+    contents: Mapping[bytes, Part] = field(default_factory=dict)
+    """Policies and traces that this state names."""
+    platforms: Sequence[tuple[int, dict[str, Any]]] = ()
+    """(first generation, platform) of the parent, up to generation `newest`."""
+    start: Part | None = None
+    """Arrays from which generation 0 starts; `RunStore.start` returns them."""
+    newest: int = -1
+    """Last generation that is taken from the parent; -1 if there is none."""
+    metrics: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
+    """Metrics that were recorded in the parent, by generation and by name; a column of this run replaces its own."""
+    evaluations: Iterable[Sequence[Row]] = ()
+    """The centres that each of these generations evaluated, likewise; none if it ends early."""
+
+
+def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Beginning) -> None:
+    """Write the data with which a run begins into its new database, in one transaction."""
+    with connection:
+        connection.execute("BEGIN IMMEDIATE")
+        in_force: dict[str, tuple[int, str]] = {}
+        for part, arrays in beginning.parts.items():
+            rows = encode_changes(beginning.newest, {part: arrays})
+            insert_state(connection, rows)
+            in_force |= rows_listed(rows)
+        insert_contents(connection, beginning.contents.items())
+        evaluations = iter(beginning.evaluations)
+        for generation, given in enumerate(beginning.history):
+            recorded = metric_values(beginning.metrics.get(generation, {}))  # what a program has recorded is no column
+            values = {column.name: given.get(column.name) for column in meta.columns if column.name not in recorded}
+            evaluated = [row_bytes(stored_values(meta.evaluation_columns, row)) for row in next(evaluations, ())]
+            # The state of the newest generation is stored, but not those of the generations before it.
+            state = state_sha256(state_sum(in_force if generation == beginning.newest else {}))
+            insert_history(connection, meta, generation, values, b"".join(evaluated), state)
+        for generation, platform in beginning.platforms:
+            record_platform(connection, generation, platform)
+        columns = {column.name for column in meta.columns}
+        for generation, named in beginning.metrics.items():
+            new = {name: value for name, value in named.items() if columns.isdisjoint(metric_values({name: value}))}
+            record_metrics(connection, generation, new)
+        if beginning.start is not None:
+            put_meta(connection, START, base64.b64encode(encode_part(beginning.start)).decode())
+
 
 _NEW_DATABASE = "run.db.new"
 _LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}

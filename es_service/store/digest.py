@@ -20,13 +20,12 @@ from es_service.loop.arrays import BLOCK, MAP
 from es_service.protocol.content import name_of
 from es_service.protocol.machine import is_mixed
 from es_service.store.codec import column_bytes, decode_part, row_bytes
-from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
-from es_service.store.platforms import sound_platforms
-from es_service.store.rows import history_rows, newest_generation
+from es_service.store.reader import reading
+from es_service.store.records import sound_platforms
+from es_service.store.rows import history_rows, leading_values, newest_generation
 from es_service.store.schema import RunMeta
 from es_service.store.states import kept_rows, rows_in_force, state_payload, whole_states
-from es_service.store.tables import leading_values
 from es_service.store.verify import verify
 
 

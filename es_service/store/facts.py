@@ -54,7 +54,7 @@ def _known_time(text: str) -> str:
 
 Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Time = Annotated[str, AfterValidator(_known_time)]
-Count = Annotated[int, Field(ge=0, lt=2**63)]
+Natural = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=1, le=2**24)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -70,7 +70,7 @@ class Constants(Form):
 
     seed: Annotated[int, Field(ge=-(2**63), lt=2**64)]
     task__environment: str
-    task__episode_steps: Count
+    task__episode_steps: Natural
     policy__hidden: list[Size]
     policy__activation: str = ""
     policy__output: str = ""
@@ -92,10 +92,10 @@ class Parent(Form):
 
     run_id: Id
     folder: str
-    generation: Count
+    generation: Natural
     digest: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None
     rollouts: list[str] = []
-    certifications: Count = 0
+    certifications: Natural = 0
 
 
 class Platform(Form):

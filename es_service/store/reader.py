@@ -6,6 +6,7 @@ functions that take a folder raise StoreError as `reading` does, and if what the
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,15 +17,22 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.protocol.content import names_in
-from es_service.store import certifications, metrics
-from es_service.store.beginning import load_start
-from es_service.store.certifications import CertifiedRow
-from es_service.store.codec import Row, row_dict
-from es_service.store.connection import reading
+from es_service.store.codec import RowValues, row_dict
 from es_service.store.facts import GENERATION, Damaged
-from es_service.store.platforms import sound_platforms
-from es_service.store.rows import HistoryRow, history_rows, newest_generation
-from es_service.store.schema import RunMeta
+from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, is_no_damage, require_run_folder
+from es_service.store.lock import lock_holder
+from es_service.store.records import (
+    CertifiedRow,
+    certified_rows,
+    load_start,
+    metric_columns,
+    metric_values,
+    next_certified_number,
+    sound_metrics,
+    sound_platforms,
+)
+from es_service.store.rows import Columns, GrowingTable, StoredRow, history_rows, newest_generation, table_rows
+from es_service.store.schema import RunMeta, load_meta
 from es_service.store.states import (
     KeptRows,
     kept_rows,
@@ -34,7 +42,70 @@ from es_service.store.states import (
     sound_part,
     whole_states,
 )
-from es_service.store.tables import Columns, GrowingTable, table_rows
+
+_BUSY_S = 5.0
+
+
+@contextlib.contextmanager
+def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
+    """Context manager with a read-only connection to the run in `folder`, inside a transaction, and its description.
+
+    All reads in it see the same generation. It should be short, because a writer cannot empty SQLite's log meanwhile.
+
+    Raises:
+        StoreError: the folder is not a run folder, the run was written by a version with another schema, or it cannot
+            be read.
+    """
+    folder = Path(folder)
+    try:
+        connection, meta = _connected(folder)
+        with contextlib.closing(connection):
+            yield connection, meta
+    except (sqlite3.Error, Damaged, OSError, UnicodeDecodeError) as error:
+        raise _unreadable(folder, error) from error
+
+
+def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
+    require_run_folder(folder)
+    if not (folder / DATABASE).exists():
+        way_out = WayOut("resume", f"restore it from {COPY}", str(folder))
+        raise StoreError(f"{folder / DATABASE} is missing", run=folder, ways_out=[way_out])
+    if not is_network_filesystem(folder) or not (folder / COPY).exists():
+        return connected_to(folder / DATABASE)
+    # On a network file system, read the copy while a writer is running.
+    if lock_holder(folder) is None:
+        try:
+            return connected_to(folder / DATABASE)
+        except sqlite3.Error as error:
+            # A killed writer may have left a transaction that must be rolled back, which readers cannot do.
+            if not is_no_damage(error, folder):
+                raise
+    return connected_to(folder / COPY)
+
+
+def connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
+    """A read-only connection to a database, inside a transaction, and the description of its run. Raises Damaged,
+    StoreError or sqlite3.Error if it cannot be read."""
+    uri = f"{file.absolute().as_uri()}?mode=ro"
+    connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
+    try:
+        connection.execute("BEGIN")
+        # The first read determines the generation that the whole transaction sees.
+        return connection, load_meta(connection, file)
+    except BaseException:
+        connection.close()
+        raise
+
+
+def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError | UnicodeDecodeError) -> StoreError:
+    if not isinstance(error, Damaged | UnicodeDecodeError) and is_no_damage(error, folder):
+        return explained(error, folder, "reading the run", "try again, or read a copy of the folder")
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
+    what = "cannot be read" if is_database else "is not a run folder"
+    way_out = WayOut("resume", "repair it as far as possible, if it is a run", str(folder))
+    return StoreError(f"{folder} {what}: {error}", run=folder, ways_out=[way_out])
+
 
 EvaluatedCentres = list[dict[str, int | float]]
 """The centres that one generation evaluated, as values by column name; NaN stands for no value."""
@@ -74,13 +145,13 @@ def read_history(
 
 
 def _with_metrics(
-    connection: sqlite3.Connection, meta: RunMeta, rows: Sequence[HistoryRow]
+    connection: sqlite3.Connection, meta: RunMeta, rows: Sequence[StoredRow]
 ) -> list[dict[str, int | float]]:
     """History rows as values by column name, with the metrics that were recorded."""
     if not rows:
         return []
-    found = metrics.sound(connection, rows[0].generation, len(rows))
-    return [row_dict(meta.columns, stored.row) | metrics.row(found.get(stored.generation, {})) for stored in rows]
+    found = sound_metrics(connection, rows[0].generation, len(rows))
+    return [row_dict(meta.columns, stored.row) | metric_values(found.get(stored.generation, {})) for stored in rows]
 
 
 def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
@@ -90,13 +161,13 @@ def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
         for stored in _sound_rows(connection, meta, 0, limit):
             table.add(stored.row)
         history = table.columns()
-        return history | metrics.columns(metrics.sound(connection, 0, limit), history["generation"])
+        return history | metric_columns(sound_metrics(connection, 0, limit), history["generation"])
 
 
 def read_metrics(folder: Path, newest: int) -> dict[int, dict[str, float]]:
     """Metrics that were recorded up to generation `newest`, by generation and by name."""
     with reading(folder) as (connection, _):
-        return metrics.sound(connection, 0, newest + 1)
+        return sound_metrics(connection, 0, newest + 1)
 
 
 def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None = None) -> list[EvaluatedCentres]:
@@ -118,7 +189,7 @@ def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
         return table.columns()
 
 
-def _evaluated(meta: RunMeta, stored: HistoryRow) -> list[Row]:
+def _evaluated(meta: RunMeta, stored: StoredRow) -> list[RowValues]:
     """The centres that a generation evaluated. Raises Damaged if they do not fit the columns."""
     try:
         return table_rows(meta.evaluation_columns, stored.evaluations)
@@ -126,7 +197,7 @@ def _evaluated(meta: RunMeta, stored: HistoryRow) -> list[Row]:
         raise Damaged(f"the history row of generation {stored.generation} cannot be read: {error}") from error
 
 
-def read_row(folder: Path, generation: int) -> HistoryRow:
+def read_row(folder: Path, generation: int) -> StoredRow:
     """All that is stored of one generation in the history."""
     with reading(folder) as (connection, meta):
         for stored in _sound_rows(connection, meta, generation, 1):
@@ -136,7 +207,7 @@ def read_row(folder: Path, generation: int) -> HistoryRow:
 
 def _sound_rows(
     connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
-) -> Iterator[HistoryRow]:
+) -> Iterator[StoredRow]:
     """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     expected = first
     for row, is_sound in history_rows(connection, meta.columns, first, limit):
@@ -217,7 +288,7 @@ def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
 def next_certification(folder: Path) -> int:
     """Number of the next certification of a run."""
     with reading(folder) as (connection, meta):
-        return certifications.next_number(connection, meta.parent)
+        return next_certified_number(connection, meta.parent)
 
 
 def read_certifications(
@@ -227,7 +298,7 @@ def read_certifications(
     whose facts are wanted, and with `holding`, those whose facts have this text as JSON."""
     with reading(folder) as (connection, _):
         rows = []
-        for (number, rank), row in certifications.rows(connection, newest, holding):
+        for (number, rank), row in certified_rows(connection, newest, holding):
             if row is None:
                 raise Damaged(f"row {rank} of certification {number} is damaged")
             try:

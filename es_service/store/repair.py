@@ -13,10 +13,10 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from es_service.errors import StoreError
-from es_service.store import certifications, metrics
-from es_service.store.connection import connected_to
 from es_service.store.facts import Damaged
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file
+from es_service.store.reader import connected_to
+from es_service.store.records import remove_certified, remove_metrics
 from es_service.store.schema import GENERATION_TABLES, OWN_HISTORY_COLUMNS, load_meta, quoted
 from es_service.store.states import collect_contents
 from es_service.store.verify import Verdict, verify
@@ -110,8 +110,8 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
             connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
         connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
         connection.execute("REINDEX content")
-        certifications.remove(connection, verdict.bad_certifications)
-        metrics.remove(connection, verdict.good)
+        remove_certified(connection, verdict.bad_certifications)
+        remove_metrics(connection, verdict.good)
         collect_contents(connection)
     if verdict.good == verdict.newest:
         notices.append(

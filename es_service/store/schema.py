@@ -48,7 +48,7 @@ _CERTIFICATION = (
 )
 METRICS = "CREATE TABLE metric (generation INTEGER PRIMARY KEY, named TEXT NOT NULL, sha256 TEXT NOT NULL)"
 OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
-"""Columns of the table history besides those of the run: the evaluated centres (`tables.table_bytes`), the SHA-256 of
+"""Columns of the table history besides those of the run: the evaluated centres (`rows.table_bytes`), the SHA-256 of
 the state, and that of the row."""
 
 

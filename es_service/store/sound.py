@@ -16,19 +16,17 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.store import metrics
 from es_service.store.codec import row_dict
-from es_service.store.connection import connected_to, reading
 from es_service.store.facts import GENERATION, Damaged
 from es_service.store.folder import COPY
-from es_service.store.platforms import sound_platforms
-from es_service.store.rows import HistoryRow, history_rows, newest_generation
+from es_service.store.reader import connected_to, reading
+from es_service.store.records import metric_columns, metric_values, sound_platforms, stored_metrics
+from es_service.store.rows import Columns, GrowingTable, StoredRow, history_rows, newest_generation, table_rows
 from es_service.store.schema import RunMeta
 from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_content, sound_part, whole_states
-from es_service.store.tables import Columns, GrowingTable, table_rows
 
 Arrays = dict[str, NDArray[Any]]
-Kept = Callable[[RunMeta, str, Arrays], Arrays | None]
+Keep = Callable[[RunMeta, str, Arrays], Arrays | None]
 """Function (the run, name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part. It raises
 ValueError for arrays that the run cannot have."""
 
@@ -60,7 +58,7 @@ class SoundRun:
 
 def read_sound(
     folder: Path,
-    kept: Kept = lambda meta, part, arrays: arrays,
+    kept: Keep = lambda meta, part, arrays: arrays,
     named: NamedBy = lambda meta, parts: (),
 ) -> SoundRun:
     """Read a run as far as it is sound; see `SoundRun`. Parts are decoded one at a time, then passed to `kept`.
@@ -80,7 +78,7 @@ class Followed:
     def __init__(
         self,
         folder: Path,
-        kept: Kept,
+        kept: Keep,
         wanted: Callable[[str], bool] = lambda part: True,
         named: NamedBy = lambda meta, parts: (),
     ) -> None:
@@ -113,9 +111,9 @@ class Followed:
             history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
             newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
             with _noted(problems, "the recorded metrics cannot be read"):
-                found, damaged = metrics.recorded(connection)
-                history |= metrics.columns(found, history["generation"])
-                newest = newest and newest | metrics.row(found.get(int(newest["generation"]), {}))
+                found, damaged = stored_metrics(connection)
+                history |= metric_columns(found, history["generation"])
+                newest = newest and newest | metric_values(found.get(int(newest["generation"]), {}))
                 if damaged:
                     which = _spans([range(at, at + 1) for at in damaged])
                     problems.append(f"the metrics recorded at generations {which} are damaged")
@@ -203,7 +201,7 @@ class _Rows:
         self._meta = meta
         self.history = GrowingTable(meta.columns)
         self.evaluations = GrowingTable((GENERATION, *meta.evaluation_columns))
-        self.last: HistoryRow | None = None
+        self.last: StoredRow | None = None
         self._lost: list[range] = []
 
     @property

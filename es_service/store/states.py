@@ -35,7 +35,7 @@ from es_service.store.codec import (
 from es_service.store.facts import Damaged
 from es_service.store.rows import newest_generation
 
-Named = Mapping[tuple[str, int], frozenset[bytes]]
+NamesByRow = Mapping[tuple[str, int], frozenset[bytes]]
 """(part, generation) of a state row -> names of contents in it."""
 KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
@@ -152,7 +152,7 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
 class KeptStates:
     """The stored state rows, as the writer of a run follows them from commit to commit."""
 
-    def __init__(self, connection: sqlite3.Connection, rows: KeptRows, named: Named, newest: int | None) -> None:
+    def __init__(self, connection: sqlite3.Connection, rows: KeptRows, named: NamesByRow, newest: int | None) -> None:
         """`rows`: all intact rows that are stored; `named`: what they and those of certified policies name; `newest`:
         newest generation, None if there is none."""
         self._rows, self._named = rows, dict(named)
@@ -203,7 +203,7 @@ class KeptStates:
         """Names of all contents that are stored."""
         return list(self._count)
 
-    def named_after(self, named: Named, outdated: Iterable[tuple[str, int]]) -> tuple[list[bytes], list[bytes]]:
+    def named_after(self, named: NamesByRow, outdated: Iterable[tuple[str, int]]) -> tuple[list[bytes], list[bytes]]:
         """Names of the contents that a commit adds, and of those that nothing names after it.
 
         Args:
@@ -217,7 +217,7 @@ class KeptStates:
     def _named_by(self, part: str, at: int | None) -> frozenset[bytes]:
         return frozenset() if at is None else self._named.get((part, at), frozenset())
 
-    def _change(self, named: Named, outdated: Iterable[tuple[str, int]]) -> Counter[bytes]:
+    def _change(self, named: NamesByRow, outdated: Iterable[tuple[str, int]]) -> Counter[bytes]:
         """By how much `_count` changes with a commit, where it may change; arguments as of `named_after`."""
         change = Counter[bytes]()
         for (part, _), names in named.items():
@@ -230,7 +230,7 @@ class KeptStates:
             change.subtract((names - earlier - later) | ((earlier & later) - names))
         return change
 
-    def add_named(self, named: Named, outdated: Iterable[tuple[str, int]] = ()) -> None:
+    def add_named(self, named: NamesByRow, outdated: Iterable[tuple[str, int]] = ()) -> None:
         """Follow what new rows name, of the state or of certified policies; arguments as of `named_after`."""
         for name, by in self._change(named, outdated).items():
             self._count[name] += by
@@ -240,7 +240,7 @@ class KeptStates:
             self._named.pop(row, None)
         self._named |= named
 
-    def commit(self, new: ListedRows, named: Named, outdated: Iterable[tuple[str, int]], total: int) -> None:
+    def commit(self, new: ListedRows, named: NamesByRow, outdated: Iterable[tuple[str, int]], total: int) -> None:
         """Follow a commit, with what `total_after` and `outdated` have returned for it."""
         self.total = total
         self.add_named(named, outdated)

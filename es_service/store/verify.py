@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from es_service.protocol.content import names_in
-from es_service.store import certifications, metrics
-from es_service.store.beginning import load_start
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
 from es_service.store.facts import Damaged
 from es_service.store.folder import is_no_damage
-from es_service.store.platforms import sound_platforms
+from es_service.store.records import CertifiedKey, certified_rows, load_start, row_name, sound_platforms, stored_metrics
 from es_service.store.rows import history_rows
 from es_service.store.schema import RunMeta, load_meta
-from es_service.store.states import KeptRows, Named, content_of, whole_states
+from es_service.store.states import KeptRows, NamesByRow, content_of, whole_states
 
 MOST_NAMED = 8
 """Most problems that a message names."""
@@ -33,11 +31,11 @@ class Verdict:
     """Newest generation whose whole state is intact, and the history up to it as well; None if there is none."""
     kept: KeptRows
     """Intact state rows, whose contents are intact, too."""
-    named: Named
+    named: NamesByRow
     """Names of contents in these rows and in those of certified policies, where there are any."""
     bad_rows: tuple[tuple[str, int], ...]
     """Damaged state rows as (part, generation), which must be deleted."""
-    bad_certifications: tuple[certifications.Key, ...]
+    bad_certifications: tuple[CertifiedKey, ...]
     """Damaged rows of the table of certified policies, which must be emptied."""
     problems: tuple[str, ...]
     """All problems found, as messages for the user."""
@@ -86,13 +84,13 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     count, sound = _history(connection, meta, first, problems)
     contents = _contents(connection, problems)
     kept, named, bad_rows = _state(connection, contents, problems)
-    bad_certified: list[certifications.Key] = []
-    for key, row in certifications.rows(connection):
+    bad_certified: list[CertifiedKey] = []
+    for key, row in certified_rows(connection):
         names = frozenset[bytes]() if row is None else names_in(row.arrays)
         if row is None or not names <= contents:
             bad_certified.append(key)
         elif names:
-            named[certifications.row_name(*key)] = names
+            named[row_name(*key)] = names
     unnamed = contents.difference(*named.values())
     problems += [f"the content {name.hex()} is named by nothing" for name in sorted(unnamed)]
     newest = count - 1 if count else None
@@ -104,7 +102,7 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
     problems += [f"row {rank} of certification {number} is damaged" for number, rank in bad_certified]
-    damaged = metrics.recorded(connection)[1]
+    damaged = stored_metrics(connection)[1]
     problems += [f"the metrics recorded at generation {at} are damaged" for at in damaged]
     return Verdict(meta, newest, good, kept, named, tuple(bad_rows), tuple(bad_certified), tuple(problems))
 

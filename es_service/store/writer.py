@@ -21,22 +21,28 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
-from es_service.loop.history import LATER, Table
+from es_service.loop.history import LATER, Row, Table
 from es_service.protocol.child import require_same_process
 from es_service.protocol.content import names_in
-from es_service.store import certifications, metrics
-from es_service.store.beginning import Beginning, load_start
-from es_service.store.codec import Part, Values, encode_changes, row_dict, rows_listed, state_sha256
-from es_service.store.create import create_run_folder
+from es_service.store.codec import Part, encode_changes, row_dict, rows_listed, state_sha256
+from es_service.store.create import Beginning, create_run_folder
 from es_service.store.facts import Damaged
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import RunLock, acquire_lock
-from es_service.store.platforms import newest_before, record, store_list
+from es_service.store.records import (
+    insert_certification,
+    load_start,
+    next_certified_number,
+    platform_before,
+    record_metrics,
+    record_platform,
+    row_name,
+    store_platform_list,
+)
 from es_service.store.repair import open_sound, patience
-from es_service.store.rows import history_rows, insert_history
+from es_service.store.rows import history_rows, insert_history, table_bytes
 from es_service.store.schema import EXTENDED_SCHEMA, SCHEMA, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_contents, insert_state, sound_content, sound_part
-from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
 _LOG = logger(__name__)
@@ -167,7 +173,7 @@ class RunStore:
         self,
         generation: int,
         parts: Mapping[str, Part | None],
-        history: Values,
+        history: Row,
         evaluations: Table = NO_ROWS,
         contents: Mapping[bytes, Part] = MappingProxyType({}),
         recorded: Mapping[str, float] = MappingProxyType({}),
@@ -210,7 +216,7 @@ class RunStore:
             if recorded:
                 metrics.record(connection, generation, recorded)
             if self._recorded:
-                store_list(connection)
+                store_platform_list(connection)
             self._hook("before_commit")
         self._recorded = False
         self.generation = generation
@@ -249,7 +255,7 @@ class RunStore:
             )
         with self._transaction("recording the platform") as connection:
             self._recorded = True
-            return record(connection, generation, platform)
+            return record_platform(connection, generation, platform)
 
     def patience(self, seconds: float) -> AbstractContextManager[None]:
         """Context manager in which the store waits so long for another program that holds the database."""
@@ -259,7 +265,7 @@ class RunStore:
     def next_certification(self) -> int:
         """Number of the next certification."""
         with self._explaining("reading the certifications"):
-            return certifications.next_number(self._connection, self.meta.parent)
+            return next_certified_number(self._connection, self.meta.parent)
 
     def add_certification(
         self, policies: Sequence[tuple[Mapping[str, Any], Part]], contents: Mapping[bytes, Part]
@@ -272,13 +278,13 @@ class RunStore:
         Raises StoreError if the arrays name what nobody has, or if the database cannot be written.
         """
         number = self.next_certification
-        named = {certifications.row_name(number, rank): names_in(arrays) for rank, (_, arrays) in enumerate(policies)}
+        named = {row_name(number, rank): names_in(arrays) for rank, (_, arrays) in enumerate(policies)}
         added, _ = self._kept.named_after(named, ())
         self._require_known(added, contents, f"certification {number}")
         with self._transaction("storing a certification") as connection:
             put_meta(connection, SCHEMA, str(EXTENDED_SCHEMA))
             insert_contents(connection, ((name, contents[name]) for name in added))
-            certifications.insert(connection, number, policies)
+            insert_certification(connection, number, policies)
         self._kept.add_named(named)
         self.upkeep.after_commit()
 
@@ -286,12 +292,12 @@ class RunStore:
         """Store metrics of a generation that is stored, in one transaction. Raises StoreError if the database cannot be
         written."""
         with self._transaction("recording metrics") as connection:
-            metrics.record(connection, generation, named)
+            record_metrics(connection, generation, named)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""
         with self._explaining("reading the platforms"):
-            return newest_before(self._connection, generation)
+            return platform_before(self._connection, generation)
 
     def close(self) -> None:
         """Make `run.db` a single file and release the lock. This may be called again.

@@ -32,7 +32,7 @@ from es_service.protocol.episodes import DispatchCounts, addressed
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.maps.behaviour_map import columns_of
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore

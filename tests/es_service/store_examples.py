@@ -14,11 +14,10 @@ from es_service.loop.history import NO_INTEGER, Column
 from es_service.protocol.content import NO_NAME, name_of, names, names_in
 from es_service.store import upkeep as store_upkeep
 from es_service.store.codec import decode_part
-from es_service.store.connection import reading
 from es_service.store.digest import digest_of, digest_parts
 from es_service.store.facts import Damaged
 from es_service.store.folder import DATABASE
-from es_service.store.reader import read_evaluations, read_history, read_parts
+from es_service.store.reader import read_evaluations, read_history, read_parts, reading
 from es_service.store.states import sound_content
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook

@@ -9,7 +9,7 @@ from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
 from es_service.store.digest import checked_parts, digest_at, digest_of, digest_parts
 from es_service.store.reader import read_generation
-from es_service.store.tables import table_bytes
+from es_service.store.rows import table_bytes
 from es_service.store.writer import RunStore
 from tests.database import database, execute
 from tests.es_service.store_examples import (

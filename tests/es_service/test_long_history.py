@@ -19,7 +19,7 @@ from es_service.report.data import read_run
 from es_service.runs.export import tables
 from es_service.search.novelty import archive_of
 from es_service.store import reader
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.writer import RunStore
 from tests.run_examples import write_run
 from tests.system.processes import ROOT

@@ -12,8 +12,7 @@ from es_service.errors import StoreError, WayOut
 from es_service.loop.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
-from es_service.store.beginning import Beginning
-from es_service.store.connection import reading
+from es_service.store.create import Beginning
 from es_service.store.reader import (
     read_evaluations,
     read_generation,
@@ -21,6 +20,7 @@ from es_service.store.reader import (
     read_meta,
     read_parts,
     read_platforms,
+    reading,
 )
 from es_service.store.writer import RunStore
 from tests.database import execute

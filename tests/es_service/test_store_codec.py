@@ -16,7 +16,7 @@ from es_service.store.codec import (
     state_sha256,
     state_sum,
 )
-from es_service.store.tables import leading_values, table_bytes
+from es_service.store.rows import leading_values, table_bytes
 from tests.es_service.store_examples import COLUMNS, as_table, assert_same_state, history_row
 
 ARRAYS = {

@@ -13,9 +13,9 @@ from es_service.protocol.content import name_of, names, names_in
 from es_service.store import repair
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
-from es_service.store.connection import connected_to
 from es_service.store.digest import checked_parts, digest_parts
 from es_service.store.reader import (
+    connected_to,
     read_certifications,
     read_evaluations,
     read_generation,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store import connection as store_connection
+from es_service.store import reader
 from es_service.store import writer as store
 from es_service.store.reader import read_generation, read_history
 from es_service.store.writer import RunStore
@@ -130,7 +130,7 @@ def test_a_repair_killed_at_any_file_operation_can_be_done_again(tmp_path, monke
 
 
 def test_on_a_network_a_killed_writer_loses_no_more(tmp_path, monkeypatch):
-    for module in (store, store_connection):
+    for module in (store, reader):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
     jobs = [job for job in KILLS if job[1] > 1]
     died = killed(tmp_path, [("network", f"{hook}-{count}", hook, count) for hook, count, _ in jobs])

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store import connection as store_connection
+from es_service.store import reader
 from es_service.store.reader import (
     read_generation,
     read_history,
@@ -105,7 +105,7 @@ def test_a_log_that_cannot_be_opened_is_no_damage(tmp_path):
 
 
 def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_connection, "_BUSY_S", 0.0)
+    monkeypatch.setattr(reader, "_BUSY_S", 0.0)
     folder = finished(tmp_path / "run", 3)
     with contextlib.closing(sqlite3.connect(folder / "run.db", isolation_level=None)) as connection:
         connection.execute("BEGIN EXCLUSIVE")

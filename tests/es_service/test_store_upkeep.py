@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store import connection as store_connection
 from es_service.store import folder as run_folder
+from es_service.store import reader
 from es_service.store import repair as store_repair
 from es_service.store import rows as store_rows
 from es_service.store import upkeep as store_upkeep
@@ -92,7 +92,7 @@ def test_a_reader_that_holds_on_does_not_fail_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(store_upkeep, "_CLOSE_PATIENCE_S", 0.05)
     folder = tmp_path / "run"
     run = create(folder, generations=3)
-    with store_connection.reading(folder) as (connection, _):
+    with reader.reading(folder) as (connection, _):
         assert connection.execute("SELECT count(*) FROM history").fetchone() == (3,)
         run.close()
     assert_same_history(read_history(folder), 3)
@@ -176,7 +176,7 @@ def test_a_copy_that_cannot_be_made_is_a_notice(tmp_path, monkeypatch):
 
 @pytest.fixture
 def on_network(monkeypatch):
-    for module in (store, store_connection):
+    for module in (store, reader):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
 
 

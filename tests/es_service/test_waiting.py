@@ -13,9 +13,8 @@ from es_service.runs import waiting
 from es_service.runs.certification import certify_run
 from es_service.runs.run_status import read_status, state
 from es_service.runs.view import open_run
-from es_service.store import connection as store_connection
+from es_service.store import reader, writer
 from es_service.store import repair as store_repair
-from es_service.store import writer
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
@@ -70,7 +69,7 @@ def begin(request, monkeypatch):
     """How a viewer begins the transaction by which the run cannot be written."""
     if request.param == "a program that writes":
         return "BEGIN IMMEDIATE"
-    for module in (writer, store_connection):
+    for module in (writer, reader):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
     return "BEGIN"
 

@@ -21,7 +21,7 @@ from es_service.report.facts import number
 from es_service.report.page import run_sections
 from es_service.report.write import python_call
 from es_service.runs.certification import certify_run
-from es_service.store import connection, upkeep, writer
+from es_service.store import reader, upkeep, writer
 from es_service.store.codec import text_sha256
 from es_service.store.lock import acquire_lock
 from es_service.watch import channels
@@ -472,12 +472,12 @@ def test_a_run_with_forged_data_hides_no_other(tmp_path, forged, said):
 
 
 def test_on_a_shared_file_system_the_copy_is_watched_while_a_driver_writes(tmp_path, monkeypatch):
-    for module in (writer, connection):
+    for module in (writer, reader):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
     monkeypatch.setattr(upkeep, "NETWORK_COPY_INTERVAL_S", 0.0)
     monkeypatch.setattr(upkeep, "COPY_TIME_FRACTION", np.inf)
-    read, opened, seen = [], connection.connected_to, []
-    monkeypatch.setattr(connection, "connected_to", lambda file: (read.append(file.name), opened(file))[1])
+    read, opened, seen = [], reader.connected_to, []
+    monkeypatch.setattr(reader, "connected_to", lambda file: (read.append(file.name), opened(file))[1])
 
     def watch(row):
         if row["generation"] < 1:

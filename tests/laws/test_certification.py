@@ -30,7 +30,7 @@ from es_service.runs.export import arrays
 from es_service.runs.selection import mean_interval, share_interval
 from es_service.runs.verification import recomputed_certifications
 from es_service.runs.view import open_run
-from es_service.store import certifications
+from es_service.store import records
 from es_service.store.codec import decode_part, encode_part
 from es_service.store.schema import EXTENDED_SCHEMA, get_meta, put_meta
 from es_service.store.writer import RunStore
@@ -235,7 +235,9 @@ def test_the_certified_policies_of_a_run_of_version_0_27_have_no_names_and_are_r
             arrays |= {name: getattr(one.policy, name) for name in OF_POLICY}
             connection.execute("DELETE FROM certification WHERE number = ? AND rank = ?", (number, rank))
             row = number, rank, facts, encode_part(arrays)
-            connection.execute("INSERT INTO certification VALUES (?, ?, ?, ?, ?)", (*row, certifications._sha256(*row)))
+            connection.execute(
+                "INSERT INTO certification VALUES (?, ?, ?, ?, ?)", (*row, records._certified_sha256(*row))
+            )
     after = certified_policies(folder)
     assert [(one.row(), one.policy.name) for one in after] == [(one.row(), one.policy.name) for one in before]
     certify_run(folder, top=5, episodes=40, keep=2)

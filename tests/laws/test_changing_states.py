@@ -29,7 +29,7 @@ from es_service.search.maps.behaviour_map import (
     with_names,
 )
 from es_service.search.novelty import archive_of, extended
-from es_service.store.beginning import Beginning
+from es_service.store.create import Beginning
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_evaluations, read_history, read_kept, read_parts
 from es_service.store.writer import RunStore

@@ -300,11 +300,11 @@ def test_verify_names_what_differs_or_cannot_be_run_in_the_other_task(of_python,
 
 @pytest.mark.parametrize("change", ["no episodes there", "episodes of no task", "another count"])
 def test_what_es_service_never_writes_is_refused(copied, change):
-    from es_service.store import certifications
+    from es_service.store import records
 
     certify_run(copied.folder, top=0, episodes=16, **CORNER)
     with database(copied.folder / "run.db") as connection:
-        [(_, row)] = certifications.rows(connection)
+        [(_, row)] = records.certified_rows(connection)
         assert row is not None
         facts, arrays = dict(row.facts), dict(row.arrays)
         if change == "no episodes there":
@@ -314,7 +314,7 @@ def test_what_es_service_never_writes_is_refused(copied, change):
         else:
             arrays["elsewhere_steps_E"] = arrays["elsewhere_steps_E"][:3]
         connection.execute("DELETE FROM certification")
-        certifications.insert(connection, 0, [(facts, arrays)])
+        records.insert_certification(connection, 0, [(facts, arrays)])
     with pytest.raises(StoreError, match="is not what es-service writes: row 0 of certification 0"):
         _ = open_run(copied.folder).certified
 
