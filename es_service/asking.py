@@ -44,7 +44,7 @@ from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
 from workers.asked_rows import Rows, gradients, results_of, rows_of
-from workers.host.policies import LanePolicies
+from workers.policies.policy import LanePolicies
 
 MOST_STEPS = 2**31 - 1
 """Most environment steps of an episode."""

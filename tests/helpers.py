@@ -24,7 +24,7 @@ from es_service.protocol.content import Policy
 from es_service.protocol.episodes import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
-from workers.recording import recorder
+from workers.rollouts import recorder
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(

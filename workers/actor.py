@@ -22,10 +22,10 @@ from es_service.protocol.sent import LackingError, Received
 from es_service.protocol.sources import OtherCodeError, why_refused
 from es_service.protocol.user_code import sendable
 from workers import progress
-from workers.xla_cache import xla_cache_settings
+from workers.compiling import xla_cache_settings
 
 if TYPE_CHECKING:  # they import JAX, whose settings are made here
-    from workers.compilable import Compilable
+    from workers.compiling import Compilable
     from workers.reports import Reports
 
 KEPT_LOGS = 16

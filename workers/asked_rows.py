@@ -26,12 +26,11 @@ from es_service.protocol.messages import (
     Work,
     WorkerSpec,
 )
-from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.noise import KEY_WORDS, seed_of
 from es_service.protocol.options import ParameterSpec
 from es_service.protocol.recipes import explicit
-from workers.compilable import Compilable
-from workers.host.policies import gradient_summer, members
-from workers.host.seeds import seed_of
+from workers.compiling import Compilable
+from workers.policies.policy import gradient_summer, members
 from workers.rollouts.backend import ChunkFunctions, Episodes
 from workers.worker import Kind, kinds_of
 

@@ -22,7 +22,7 @@ from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec, recipes_in
 from es_service.protocol.user_code import sendable
 from workers import progress
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.rollouts import BACKENDS
 from workers.worker import make_worker
 

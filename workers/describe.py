@@ -1,8 +1,6 @@
 """Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX, or code
 of the user.
 
-    python -m workers.describe DESCRIPTOR     # run by `es_service.protocol.child`
-
 A task of Python objects then has a short trial: does an episode repeat itself?
 """
 
@@ -10,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 import time
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -19,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.child import answer_parent
 from es_service.protocol.messages import NO_CHOICES, HostChoices, TaskSpec
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue, option_values
@@ -111,7 +107,7 @@ def descriptions(name: str, settings: Mapping[str, Any]) -> Callable[[str], Any]
         try:
             task = described(name, settings)
             if task.kind == "jax" and name.partition(":")[0] not in ("brax", "mujoco", *SUITES):
-                from workers.traces import require_pure
+                from workers.step_checks import require_pure
 
                 require_pure(task, options())
             return json.dumps({"task": dataclasses.asdict(task)})
@@ -119,7 +115,3 @@ def descriptions(name: str, settings: Mapping[str, Any]) -> Callable[[str], Any]
             return json.dumps({"problem": str(error)})
 
     return answer
-
-
-if __name__ == "__main__":
-    answer_parent(int(sys.argv[1]), descriptions)

@@ -1,17 +1,13 @@
-"""Measure the speed of a task on one core, in a separate process that `es-service bench rollouts` starts.
-
-python -m workers.measure DESCRIPTOR     # run by `es_service.protocol.child`
-"""
+"""Measure the speed of a task on one core, in a separate process that `es-service bench rollouts` starts."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from es_service.protocol.child import answer_parent
 from es_service.protocol.machine import peak_memory_mib
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
@@ -102,5 +98,6 @@ def _with_policy(
     return call
 
 
-if __name__ == "__main__":
-    answer_parent(int(sys.argv[1]), lambda task, given: lambda: measure(task, **given))
+def measurer(task: str, given: Mapping[str, Any]) -> Callable[[], dict]:
+    """Function that measures, for a child process; `given`: the other arguments of `measure`."""
+    return lambda: measure(task, **given)

@@ -24,13 +24,13 @@ from es_service.protocol.sources import why_refused
 from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import framed, receive
 from workers import progress
+from workers.compiling import xla_cache_settings
 from workers.progress import Seen
 from workers.reports import Reports, require_room
 from workers.rollouts import BACKENDS, platform_of_gpu
-from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here
-    from workers.compilable import Compilable
+    from workers.compiling import Compilable
     from workers.rollouts.backend import ChunkFunctions
 
 REPORT_S = 0.5

@@ -22,7 +22,7 @@ from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.policy_spec import PolicySpec, layers_of_noise, numbers, product_unit
 from es_service.protocol.recipes import explicit
-from workers.compilable import Compilable, jitted
+from workers.compiling import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
 from workers.policies.pairs import act_in_pairs, act_low_rank

@@ -36,7 +36,7 @@ from es_service.protocol.messages import (
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import POLICIES_TOGETHER, slots
 from workers import progress
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.rollouts import BACKENDS
 from workers.rollouts.backend import (
     ChunkFunctions,

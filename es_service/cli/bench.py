@@ -96,7 +96,7 @@ def _options(task: str, overrides: Overrides) -> dict[str, Any]:
 
 def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
     with ExitStack() as ends:  # in case one fails or a signal arrives
-        started = [ends.enter_context(Child("workers.measure", child_environment())) for _ in range(count)]
+        started = [ends.enter_context(Child("workers.measure:measurer", child_environment())) for _ in range(count)]
         for process in started:
             process.ask(arguments["task"], {name: value for name, value in arguments.items() if name != "task"})
             process.ask()

@@ -181,7 +181,7 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     Args:
         settings: what a config chooses for it, as JSON.
     """
-    with Child("workers.describe", child_environment()) as child:
+    with Child("workers.describe:descriptions", child_environment()) as child:
         try:
             child.call(name, json.loads(settings), limit_s=DESCRIBE_S)
             answer = json.loads(child.call("task", limit_s=DESCRIBE_S))

@@ -3,12 +3,14 @@
 A child runs a module of ours and has the other end of a socket. It ends with this process, however this one ends, and
 so does all that it has started.
 
-`python -m es_service.protocol.child PARENT MODULE ARGUMENT...` runs a module in a process that is bound like this.
+`python -m es_service.protocol.child PARENT MODULE:FUNCTION DESCRIPTOR` answers requests by `answer_parent`, in a
+process that is bound like this. With MODULE alone, it runs the module, with the arguments that follow.
 """
 
 from __future__ import annotations
 
 import ctypes
+import importlib
 import os
 import runpy
 import select
@@ -67,14 +69,17 @@ class End(NamedTuple):
 
 
 class Child:
-    """A process that runs a module, whose last argument is the descriptor of the other end of `socket`.
+    """A process that runs a program, bound to this process.
 
-    It and all that it has started end with this process, when it is ended, or when nobody refers to it. With
-    `answer_parent` in its module, it answers requests, one after another: the first has the arguments of `make`, whose
-    answer is None. If the wait for an answer is interrupted, it is ended, since a later request would get that answer.
+    `module:function` answers requests by `answer_parent` with the function, one after another: the first has the
+    arguments of `make`, and its answer is None. A module alone is run as a script, whose last argument is the
+    descriptor of the other end of `socket`.
+
+    It and all that it has started end with this process, when it is ended, or when nobody refers to it. If the wait for
+    an answer is interrupted, it is ended, since a later request would get that answer.
     """
 
-    def __init__(self, module: str, environment: Mapping[str, str], output_bytes: int | None = OUTPUT_BYTES) -> None:
+    def __init__(self, program: str, environment: Mapping[str, str], output_bytes: int | None = OUTPUT_BYTES) -> None:
         """Start it.
 
         Args:
@@ -90,7 +95,7 @@ class Child:
                 undo.callback(newest_output().forget, watched)
             process = start_child(
                 lambda: subprocess.Popen(
-                    bound(module, str(theirs.fileno())),
+                    bound(program, str(theirs.fileno())),
                     env=environment,
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
@@ -209,7 +214,7 @@ class Child:
         self.end()
 
 
-def answer_of(module: str, *given: Any, request: tuple[Any, ...] = (), limit_s: float) -> Any:
+def answer_of(program: str, *given: Any, request: tuple[Any, ...] = (), limit_s: float) -> Any:
     """What a new child with the environment of a worker answers to one request.
 
     Args:
@@ -219,7 +224,7 @@ def answer_of(module: str, *given: Any, request: tuple[Any, ...] = (), limit_s: 
     Raises as `Child.answer`.
     """
     until_s = time.monotonic() + limit_s
-    with Child(module, child_environment()) as child:
+    with Child(program, child_environment()) as child:
         child.call(*given, limit_s=limit_s)
         answer = child.call(*request, limit_s=max(0.0, until_s - time.monotonic()))
         child.end(END_S)
@@ -230,7 +235,7 @@ def answer_parent(descriptor: int, make: Callable[..., Callable[..., Any]]) -> N
     """Answer requests until the parent closes its end; what raises is answered with a RaisedError.
 
     Args:
-        descriptor: of the socket, as the last argument of the module.
+        descriptor: of the socket, as the last argument of the program.
         make: gives the function that answers; called with the name of the user's code, and what else was given.
     """
     os.set_inheritable(descriptor, False)
@@ -294,9 +299,9 @@ def socket_pair() -> tuple[socket.socket, socket.socket]:
     return pair
 
 
-def bound(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module in a child process bound to this process."""
-    return [sys.executable, "-m", "es_service.protocol.child", str(os.getpid()), module, *arguments]
+def bound(program: str, *arguments: str) -> list[str]:
+    """The command that runs a module, or one of its functions, in a child process bound to this process."""
+    return [sys.executable, "-m", "es_service.protocol.child", str(os.getpid()), program, *arguments]
 
 
 def start_child(start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
@@ -368,4 +373,8 @@ def _look_for(parent: int) -> None:
 if __name__ == "__main__":
     end_with(int(sys.argv[1]))
     del sys.argv[:2]
-    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    module, _, function = sys.argv[0].partition(":")
+    if function:
+        answer_parent(int(sys.argv[1]), getattr(importlib.import_module(module), function))
+    else:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)

@@ -237,3 +237,8 @@ TEST_VECTORS: tuple[tuple[tuple[int, Domain, int, tuple[int, ...]], tuple[int, .
 )
 """Values that every implementation must give: (seed, domain, generation, ids) and `normal_integers` at coordinates 0,
 1, 2."""
+
+
+def seed_of(reset_key_4: NDArray[np.uint32]) -> int:
+    """The seed of a reset, a whole number below 2^31, which every generator accepts, from its stream key."""
+    return int(reset_key_4[0]) >> 1

@@ -100,7 +100,7 @@ def record(
     ]
     task, spec = config.task.environment, worker_spec(config, task_of(config))
     try:
-        recorded = answer_of("workers.recording", task, spec, request=(requests,), limit_s=RECORD_S)
+        recorded = answer_of("workers.rollouts:recorder", task, spec, request=(requests,), limit_s=RECORD_S)
     except (NoAnswerError, RaisedError) as error:
         why = f"their process {error}" if isinstance(error, NoAnswerError) else error
         raise EvaluationError(f"episodes could not be recorded: {why}") from None

@@ -273,7 +273,7 @@ def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str
         seconds: duration of its measurement.
     """
     try:
-        return answer_of("workers.host.examine", name, settings, request=(seconds,), limit_s=LONGEST_S)
+        return answer_of("workers.host.examine:examiner", name, settings, request=(seconds,), limit_s=LONGEST_S)
     except RaisedError as error:
         return {"problem": error.message}
     except NoAnswerError as error:

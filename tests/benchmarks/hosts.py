@@ -41,7 +41,7 @@ from es_service.protocol.messages import (
 from tests.helpers import SPEC
 from tests.system.cluster import Cluster, missing
 from workers.actor import WorkerActor
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.cores import divided
 
 HOSTS, CORES = 4, 16

@@ -43,7 +43,7 @@ from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from tests.helpers import AtTheEnd
 from workers import worker
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.rollouts import BACKENDS
 
 FILLING = 50

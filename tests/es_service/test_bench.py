@@ -13,7 +13,7 @@ from es_service.cli import bench
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.child import Child
 
-FAILS, HANGS = "tests.es_service.shell_child", "tests.es_service.test_system"
+FAILS, HANGS = "tests.es_service.shell_child:shell", "tests.es_service.test_system"
 """Modules: the first refuses what `workers.measure` is asked, the second sleeps."""
 
 

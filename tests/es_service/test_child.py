@@ -15,7 +15,7 @@ from es_service.protocol.child import Child, NoAnswerError, answer_of
 from es_service.protocol.process_environment import DEPTH, MOST_DEPTH, child_environment, require_no_import_of_a_task
 from es_service.protocol.user_code import RaisedError
 
-SHELL = "tests.es_service.shell_child"
+SHELL = "tests.es_service.shell_child:shell"
 LONG_S = 60.0
 """Longer than any of these tests may take."""
 DESCRIBED = """

@@ -29,8 +29,8 @@ from es_service.gymnasium import id_of
 from es_service.protocol.noise import Domain, stream_keys
 from tests.workers.simd.rollouts import targets
 from tests.workers.steps import environment_of
+from workers import lanes
 from workers.environments import SHIPPED, TaskError
-from workers.lanes import compiled
 from workers.simd.episodes import kernel
 
 POLE = "tests.examples.cart_pole:CartPole"
@@ -100,12 +100,12 @@ def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_
     expected = seen(TaskVectorEnv(task, 1, max_episode_steps=5), 0)
     for target in targets():
         monkeypatch.setattr(kernel, "host_target", lambda target=target: target)
-        compiled.kernels.cache_clear()
+        lanes.kernels.cache_clear()
         for count, threads in ((4, 1), (70, 1), (70, 3), (200, 2)):
             envs = TaskVectorEnv(task, count, max_episode_steps=5, threads=threads)
             assert seen(envs, lane) == expected
             envs.close()
-    compiled.kernels.cache_clear()
+    lanes.kernels.cache_clear()
 
 
 @pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.long)])

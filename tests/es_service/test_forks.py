@@ -76,7 +76,7 @@ in_fork(use)
 same(envs.step(actions)[:3], others.step(actions)[:3])
 """
 CHILD = """
-from workers.host.caller import Caller
+from workers.host.functions import Caller
 call = Caller("function:tests.examples.beam:beam", {}, 60.0)
 design = np.full(len(call.task.parameters.names), 0.5, np.float32)
 before = call(design, 0)

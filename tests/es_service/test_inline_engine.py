@@ -31,7 +31,7 @@ from es_service.protocol.user_code import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 
-SHELL = "tests.es_service.shell_child"
+SHELL = "tests.es_service.shell_child:shell"
 FIRST = centre(random_parameters(0))
 CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(2)]
 

@@ -35,7 +35,7 @@ from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import centre, spec
 from workers import process
 from workers.actor import WorkerActor
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.reports import Reports
 
 PARENTS, WORKERS = 60, 2
@@ -88,7 +88,7 @@ class Threads(inline_module.ChildProcesses):
         """Names of the parents that were sent with each work item."""
 
     def start(self, worker: int) -> None:
-        child = Child("tests.es_service.shell_child", child_environment())
+        child = Child("tests.es_service.shell_child:shell", child_environment())
         ours, theirs = socket_pair()
         computing: Future[Any] = Future()
         computing.set_result(process.Made(COMPUTING, set()))

@@ -177,7 +177,7 @@ def test_the_newest_wait_and_those_that_have_waited_longest_end():
     most = IDLE_PER_CORE * cores()
     some = Staying()
     some.enter()
-    children = [Child("tests.es_service.shell_child", child_environment()) for _ in range(most + 1)]
+    children = [Child("tests.es_service.shell_child:shell", child_environment()) for _ in range(most + 1)]
     for number, child in enumerate(children):
         some.give(number % 2, child)
     assert [child.is_ended for child in children] == [True] + [False] * most

@@ -56,7 +56,7 @@ JOINERS = {
 RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 """Modules of es_service that import Ray, inside the functions that need it: all others are given the module."""
 OTHER_MEANINGS = {
-    "workers.xla_cache": {"xla"},
+    "workers.compiling": {"xla"},
     "es_service.asking": {"asked"},
     "es_service.cli.show": {"simd"},
     "es_service.store.lock": {"host"},

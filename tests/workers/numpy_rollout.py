@@ -17,7 +17,7 @@ from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.references import point_maze
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.policies.policy import act, action, drawn_action, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 

@@ -18,7 +18,7 @@ from tests.helpers import spec
 from tests.system.processes import ROOT, is_running
 from tests.workers.test_worker import bits, work
 from workers import cores as module
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.cores import make_worker_with_cores, parts
 from workers.worker import make_worker
 

@@ -27,8 +27,7 @@ from tests.helpers import centre, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import functions
 from workers.environments import TaskError, describe_environment, make_function_task
-from workers.host.caller import Caller
-from workers.host.functions import _called
+from workers.host.functions import Caller, _called
 from workers.worker import make_worker
 
 MODULE = "tests.workers.functions"
@@ -366,7 +365,7 @@ def test_what_a_call_has_started_ends_with_its_worker(how):
     program = f"""
 import os, time
 import numpy as np
-from workers.host.caller import Caller
+from workers.host.functions import Caller
 caller = Caller("function:{MODULE}:starting", {{}}, 20.0)
 print(int(caller(np.zeros(1, np.float32), 0)[0]), flush=True)
 {how}

@@ -38,11 +38,11 @@ from tests.system.processes import is_running
 from tests.workers import host_tasks
 from workers.describe import does_not_repeat
 from workers.environments import TaskError, describe_environment, make_host_task
+from workers.environments.gymnasium_task import KeyedGenerator
 from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import EnvironmentPool
 from workers.host.examine import examine
-from workers.host.policies import LanePolicies
-from workers.host.seeds import KeyedGenerator
+from workers.policies.policy import LanePolicies
 from workers.worker import make_worker
 
 MODULE = "tests.workers.host_tasks"

@@ -23,7 +23,7 @@ from es_service.protocol.sources import modules_of, user_sources
 from es_service.runs.certification import certify, certify_run
 from workers.environments import describe_environment, make_environment
 from workers.environments.mujoco_parts import mujoco
-from workers.step_cost import LANES, step_cost
+from workers.step_checks import LANES, step_cost
 
 ROOT = Path(__file__).parents[2]
 ARM = "tests.examples.reaching_arm:ReachingArm"

@@ -15,7 +15,7 @@ from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
 from workers import environments
 from workers.environments import SHIPPED
-from workers.recording import recorder
+from workers.rollouts import recorder
 from workers.viewer import Viewer, scene
 
 

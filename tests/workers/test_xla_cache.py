@@ -7,7 +7,7 @@ import os
 import pytest
 
 from es_service import api
-from workers.xla_cache import xla_cache_settings
+from workers.compiling import xla_cache_settings
 
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from workers.environments.mujoco_contacts import AT_ONCE
-from workers.environments.mujoco_gym_humanoids import humanoid, humanoid_standup
 from workers.environments.mujoco_gym_parts import (
     GymState,
     Parts,
     Range,
     Simulated,
     body_forces,
+    humanoid,
+    humanoid_standup,
     inside,
     noisy,
     uniforms_at,

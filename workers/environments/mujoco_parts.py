@@ -3,8 +3,8 @@
 A model is an `mujoco.MjModel`, whose own options decide: timestep, integrator (Euler with or without `eulerdamp`,
 implicitfast, RK4), cone (pyramidal, elliptic), solver (Newton, CG) with its iterations and tolerances. `put_model`
 makes MJX's model of it, or refuses it with the names of the elements that MJX lacks. Everything else of MuJoCo is MJX's
-own and is used as it is, but for RK4, the contacts of capsules with planes and with cylinders
-(`mujoco_colliders.py`), and how contacts are solved (`mujoco_contacts.py`).
+own and is used as it is, but for RK4, the contacts of capsules with planes and with cylinders (`contacts_as_c`), and
+how contacts are solved (`mujoco_contacts.py`).
 
 Made with mujoco 4.0.0 and mujoco-mjx 3.17.0 (`constraints.txt`); tests compare both with MuJoCo's own code in C
 (`tests/workers/test_mujoco_oracles.py`). Another version of MJX may compute something else, and other lines of it may
@@ -25,8 +25,7 @@ import numpy as np
 
 from workers.environments import TaskError
 from workers.environments.brax_task import Transform, quietly
-from workers.environments.mujoco_colliders import contacts_as_c
-from workers.environments.mujoco_contacts import AT_ONCE, solve
+from workers.environments.mujoco_contacts import AT_ONCE, contacts_as_c, solve
 from workers.viewer import Viewer
 
 mujoco: Any = importlib.import_module("mujoco")  # its module does not say what it contains

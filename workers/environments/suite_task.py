@@ -33,7 +33,7 @@ from es_service.protocol.options import Option, OptionValue
 from workers.environments import Environment, TaskError
 from workers.environments.brax_task import quietly
 from workers.environments.host_task import action_bounds
-from workers.environments.keys import words_in_place_of_keys
+from workers.environments.user_task import words_in_place_of_keys
 
 
 @dataclass(frozen=True)

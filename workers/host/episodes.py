@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
+from es_service.protocol.noise import seed_of
 from es_service.protocol.outputs import AT_THE_END, METRICS, OF_STEPS
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
-from workers.host.policies import LanePolicies
-from workers.host.seeds import seed_of
+from workers.policies.policy import LanePolicies
 from workers.rollouts.backend import Episodes, FailedEpisode, observation_text, raised_in_lane
 
 

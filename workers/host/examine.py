@@ -1,15 +1,12 @@
 """Try a task: whether its numbers are finite, whether its descriptor tells episodes apart, and one of Python objects or
 a function whether it repeats and how fast.
 
-    python -m workers.host.examine DESCRIPTOR     # run by `es_service.protocol.child`
-
 `es-service doctor TASK` runs it in two processes and compares their hashes.
 """
 
 from __future__ import annotations
 
 import hashlib
-import sys
 import time
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -18,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.child import answer_parent
 from es_service.protocol.machine import peak_memory_mib
 from es_service.protocol.messages import HostChoices, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
@@ -59,7 +55,7 @@ class Examined:
     same_descriptor_B: list[float] = field(default_factory=list)
     """Descriptor of all of these episodes, if they have the same one; else empty, and for functions."""
     step: dict[str, Any] = field(default_factory=dict)
-    """Of a task in JAX: the fields of `workers.step_cost.StepCost`."""
+    """Of a task in JAX: the fields of `workers.step_checks.StepCost`."""
 
 
 def examine(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostChoices, seconds: float) -> Examined:
@@ -77,7 +73,7 @@ def examine(task: TaskSpec, options: Mapping[str, OptionValue], choices: HostCho
         hashes = {ALONE: call(SEED), "after another call": (call(OTHER_SEED), call(SEED))[1]}
         return _measured(hashes, lambda: (call(SEED), 1)[1], seconds)
     if task.kind == "jax":
-        from workers.step_cost import step_cost
+        from workers.step_checks import step_cost
 
         fault, same_B = _tried(task, options, choices)
         step = {} if fault else asdict(step_cost(task, options, seconds))
@@ -179,7 +175,3 @@ def examiner(name: str, settings: Mapping[str, Any]) -> Callable[[float], dict[s
     task = described(name, settings)
     options = option_values(task.options, settings.get("options", {}))
     return lambda seconds: asdict(examine(task, options, choices_of(settings), seconds))
-
-
-if __name__ == "__main__":
-    answer_parent(int(sys.argv[1]), examiner)

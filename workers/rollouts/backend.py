@@ -20,7 +20,7 @@ from es_service.protocol.options import OptionValue
 from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from es_service.protocol.rollouts import Rollout
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 
 _LANE = "_es_service_lane"
 """Attribute of an exception that was raised in an episode."""

@@ -8,19 +8,17 @@ from functools import partial
 import numpy as np
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, TaskSpec, WorkerSpec
-from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, seed_of, stream_keys
 from es_service.protocol.options import OptionValue
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import progress
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
-from workers.host.caller import Caller
 from workers.host.episodes import EnvironmentPool, Watched, known_from_the_start, run_episodes
-from workers.host.functions import run_calls
-from workers.host.policies import gradient_summer, members
-from workers.host.seeds import seed_of
+from workers.host.functions import Caller, run_calls
+from workers.policies.policy import gradient_summer, members
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 

@@ -17,7 +17,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, strea
 from es_service.protocol.options import OptionValue
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import environments
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.rollouts.backend import (
     BAD_REWARD,
     NO_FAULT,

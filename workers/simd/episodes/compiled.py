@@ -16,7 +16,7 @@ import numpy as np
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.environments import Environment
 from workers.episode import Carry
 from workers.rollouts.backend import Episodes, no_faults

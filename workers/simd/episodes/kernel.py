@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.noise import KEY_WORDS
-from workers.compilable import Compilable, jitted
+from workers.compiling import Compilable, jitted
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import (
     ALIGNMENT,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.policy_spec import PolicySpec, layers_of_noise, numbers, product_unit
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target

@@ -18,7 +18,7 @@ from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue, option_values
 from es_service.protocol.recipes import Recipes
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
 from workers.rollouts.backend import Episodes, no_faults

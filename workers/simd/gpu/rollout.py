@@ -12,7 +12,7 @@ import numpy as np
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import Keys
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.environments import Environment
 from workers.rollouts.backend import Episodes
 from workers.simd.backend.native import require_same

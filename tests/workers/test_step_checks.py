@@ -11,7 +11,7 @@ import pytest
 
 from workers import describe
 from workers.environments import TaskError, user_task
-from workers.traces import require_pure
+from workers.step_checks import require_pure
 
 calls = itertools.count()
 
