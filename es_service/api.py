@@ -14,7 +14,7 @@ from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
-from es_service.protocol.episodes import Session
+from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.machine import given_path
 from es_service.report.progress import in_notebook, show_in_notebook
 from es_service.runs import view
@@ -112,7 +112,7 @@ def run(
 
 def _begin(
     config: RunConfig, out: str | os.PathLike[str] | None, named: str | None, listener: Listener
-) -> Session[Outcome]:
+) -> OverlappedRequests[Outcome]:
     """Start a run whose config was loaded from a file of this name."""
     again = WayOut("run", "", config=named, out=_text(out))
     parent, beginning = None, Beginning()
@@ -176,7 +176,9 @@ def run_or_resume(
     )
 
 
-def begin_or_resume(config: RunConfig | Source, out: str | os.PathLike[str], listener: Listener) -> Session[Outcome]:
+def begin_or_resume(
+    config: RunConfig | Source, out: str | os.PathLike[str], listener: Listener
+) -> OverlappedRequests[Outcome]:
     """The session of `run_or_resume`, and of `ask_tell`."""
     folder = given_path(out)
     begun = holds_run(folder)

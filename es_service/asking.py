@@ -27,7 +27,7 @@ from es_service.config.tasks import CALLER, task_of
 from es_service.config.workload import worker_spec
 from es_service.errors import ConfigError, EvaluationError, ForkedError
 from es_service.protocol.child import require_same_process
-from es_service.protocol.episodes import Session
+from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.machine import given_path
 from es_service.protocol.messages import (
     ChunkResult,
@@ -128,7 +128,7 @@ class AskTell:
         folder: Path,
         spec: WorkerSpec,
         dimensions: int,
-        session: Session[Outcome],
+        session: OverlappedRequests[Outcome],
         metrics: dict[str, float],
     ) -> None:
         """Begin nothing yet.

@@ -17,7 +17,7 @@ import pytest
 
 from es_service.dispatch.events import Limits
 from es_service.errors import Interrupted
-from es_service.loop.arrays import MAP, joined, value_of
+from es_service.loop.blocks import MAP, joined, value_of
 from es_service.loop.contents import stored_elite
 from es_service.loop.history import NO_INTEGER
 from es_service.protocol.content import Policy

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from es_service.config.workload import policy_spec
-from es_service.loop.arrays import stored
+from es_service.loop.blocks import stored
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.loop.state import Best, RunState
 from es_service.protocol.content import NAME, Policy, name_of, names

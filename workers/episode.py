@@ -3,8 +3,8 @@
 `normalised_observation` and `advance` together are one control step; the policy acts between them. A finished episode
 continues to be computed but is masked, so steps after `done` never count.
 
-OUTPUTS are computed only if a run names them, besides what every result has; `es_service/protocol/outputs.py` has their
-names.
+OUTPUTS are computed only if a run names them, besides what every result has; their names are in
+`es_service/protocol/episodes.py`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from es_service.protocol.episodes import AT_THE_END, METRICS, OF_STEPS
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
-from es_service.protocol.outputs import AT_THE_END, METRICS, OF_STEPS
 from workers.environments import Environment
 from workers.policies.policy import action, drawn_action, initial_memory, normalise
 from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
@@ -111,7 +111,7 @@ OUTPUTS: Mapping[str, EpisodeOutput] = {
     "step_descriptor": _of_state(lambda environment, state: jnp.asarray(environment.descriptor(state), jnp.float32)),
 }
 """All outputs by name."""
-assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/outputs.py has its functions here"
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/episodes.py has its functions here"
 
 
 class Carry(NamedTuple):

@@ -11,8 +11,8 @@ from rich.console import Console
 from es_service.cli.common import command, print_line, settings, way_command
 from es_service.errors import StoreError, counted
 from es_service.loop.history import evaluated_nouns
-from es_service.report.facts import number
 from es_service.report.progress import plain_line
+from es_service.report.summary import number
 from es_service.runs.certified import (
     Certified,
     certified_elsewhere,

@@ -29,7 +29,7 @@ from es_service.config.keys import (
     parts_of,
     search_fields,
 )
-from es_service.config.model import Kept, Made, RunConfig, nested, replaces
+from es_service.config.model import ConfigOrigin, Kept, RunConfig, nested, replaces
 from es_service.config.parts import TASK_OPTIONS, as_tuple
 from es_service.config.resolution import Unknown, Values, asks
 from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of, unknown_output
@@ -67,9 +67,9 @@ class Reading:
     wanted: Mapping[str, Any]
     """Values of overrides."""
     left_out: Mapping[str, str]
-    """See `Made.left_out`."""
+    """See `ConfigOrigin.left_out`."""
     kept: Mapping[str, Kept]
-    """See `Made.kept`."""
+    """See `ConfigOrigin.kept`."""
     values: Values
     problems: Sequence[Problem]
     task: TaskSpec | None
@@ -91,7 +91,7 @@ class Reading:
         config = RunConfig.model_validate(sections | {"search": self.settings.model_validate(sections["search"])})
         if problem := unknown_output(config.search, self.task):
             raise ConfigError.listing(f"{self.name}: 1 problem", [problem])
-        return config.made_of(Made(self.values.task, given, self.left_out, self.kept))
+        return config.made_of(ConfigOrigin(self.values.task, given, self.left_out, self.kept))
 
     @cached_property
     def idle(self) -> dict[str, str]:
@@ -242,7 +242,7 @@ def _is_replaced(key: str, file: Mapping[str, Any], wanted: Mapping[str, Any]) -
 
 
 def _of_another_task(file: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, str]:
-    """See `Made.left_out`: what goes with a task that overrides replace."""
+    """See `ConfigOrigin.left_out`: what goes with a task that overrides replace."""
     if not _is_replaced("task.environment", file, wanted):
         return {}
     why = f"{wanted['task.environment']} replaces its task"
@@ -261,7 +261,7 @@ def _of_another_method(
     settings: type[SearchConfig],
     algorithms: Methods,
 ) -> dict[str, str]:
-    """See `Made.left_out`: what goes with a method, or with the kind of a part, that overrides replace."""
+    """See `ConfigOrigin.left_out`: what goes with a method, or with the kind of a part, that overrides replace."""
     left_out: dict[str, str] = {}
     if other := _is_replaced("search.algorithm", file, wanted):
         known = file if ":" in str(file.get("search.algorithm")) else all_search_fields(algorithms)
@@ -277,7 +277,7 @@ def _of_another_method(
 
 
 def _kept(parsed: Parsed, chosen: Values, settings: type[SearchConfig] | None, algorithms: Methods) -> dict[str, Kept]:
-    """See `Made.kept`."""
+    """See `ConfigOrigin.kept`."""
     kept: dict[str, Kept] = {}
     before = chosen.of(parsed.file)
     choices = [key for key in parsed.wanted if key == "search.algorithm" or key.endswith(f".{KIND}")]

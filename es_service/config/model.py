@@ -72,7 +72,7 @@ def replaces(key: str, value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Made:
+class ConfigOrigin:
     """What a config was made from."""
 
     task: TaskSpec
@@ -102,16 +102,16 @@ class RunConfig(Section):
         0,
         description="Seed of all random numbers of the run. The same seed and settings give the same run, bit for bit.",
     )
-    _made: Made | None = PrivateAttr(None)
+    _made: ConfigOrigin | None = PrivateAttr(None)
 
-    def made_of(self, made: Made) -> RunConfig:
+    def made_of(self, made: ConfigOrigin) -> RunConfig:
         """The same config, which knows what it was made from."""
         config = self.model_copy()
         config._made = made
         return config
 
     @property
-    def made(self) -> Made:
+    def made(self) -> ConfigOrigin:
         """What the config was made from."""
         if self._made is None:
             raise ValueError("this config was not loaded; load it with load_config")

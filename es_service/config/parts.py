@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from es_service.protocol.episodes import CHOSEN_METRIC
 from es_service.protocol.messages import Bounds
 from es_service.protocol.options import OptionValue
-from es_service.protocol.outputs import CHOSEN_METRIC
 from es_service.protocol.policy_spec import MOST_RANK
 
 TASK_OPTIONS = "task.options."

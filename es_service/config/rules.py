@@ -21,8 +21,8 @@ from es_service.config.search import SearchConfig
 from es_service.config.tasks import CALLER, is_start
 from es_service.config.text import not_allowed, one_of, problem_of, show, wrong_value
 from es_service.errors import Problem
+from es_service.protocol.episodes import AT_THE_END, METRICS
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.outputs import AT_THE_END, METRICS
 from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS
 from es_service.protocol.rollouts import CHUNK_PAIRS
 

@@ -22,6 +22,7 @@ from es_service.config.resolution import options_of
 from es_service.config.text import in_line, nearest, one_of, problem_of, show, wrong_value
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.child import END_S, Child, NoAnswerError
+from es_service.protocol.episodes import CHOSEN_METRIC
 from es_service.protocol.messages import NO_CHOICES, UNBOUNDED, HostChoices, TaskSpec, with_options
 from es_service.protocol.options import (
     FREE,
@@ -35,7 +36,6 @@ from es_service.protocol.options import (
     is_plain,
     option_values,
 )
-from es_service.protocol.outputs import CHOSEN_METRIC
 from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import task_code, user_sources

@@ -9,8 +9,8 @@ from es_service.config.rules import MOST_CHUNK_PAIRS
 from es_service.config.search import PopulationConfig
 from es_service.config.tasks import CALLER, ROLLOUTS
 from es_service.errors import ConfigError, counted
+from es_service.protocol.episodes import METRICS
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, PolicySpec, TaskSpec, WorkerSpec
-from es_service.protocol.outputs import METRICS
 from es_service.protocol.policies import chunks_of
 from es_service.protocol.rollouts import Rollouts, why_not
 from es_service.protocol.sources import worker_sources

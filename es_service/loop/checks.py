@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.text import one_of
 from es_service.errors import EvaluationError, StoreError, WayOut
-from es_service.loop.arrays import names_of, stored
+from es_service.loop.blocks import names_of, stored
 from es_service.loop.state import RunState
 from es_service.protocol.episodes import INFEASIBLE
 from es_service.protocol.messages import Centre, EpisodesResult
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import Recipes
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
 from es_service.search.arrays import problem as problem_of_extra
 from es_service.search.maps.behaviour_map import COLUMNS, BehaviourMap

@@ -17,9 +17,8 @@ from es_service.errors import EvaluationError, StoreError
 from es_service.protocol.content import NAME, Arrays, Cache, Policy, as_bytes, name_of, names, policy_of
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, with_subject
 from es_service.protocol.noise import Domain
-from es_service.protocol.policies import POLICY_SLOTS, chunks_of
+from es_service.protocol.policies import POLICY_SLOTS, Origin, Recipes, chunks_of, unvaried
 from es_service.protocol.policy_spec import PolicySpec
-from es_service.protocol.recipes import Origin, Recipes, unvaried
 from es_service.search.algorithms.base import PolicyAsk
 from es_service.search.arrays import freeze
 from es_service.search.maps.behaviour_map import Elite
@@ -179,7 +178,7 @@ class Named:
         return name
 
 
-class Contents:
+class StatePolicies:
     """The policies that a state names. Those of the newest generation need not be stored yet."""
 
     def __init__(self, read: Callable[[bytes], Arrays], most_bytes: int = RECENT_BYTES) -> None:

@@ -20,7 +20,7 @@ from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
 from es_service.config.workload import policy_spec
 from es_service.loop import budget as budgets
-from es_service.loop.arrays import state_of
+from es_service.loop.blocks import state_of
 from es_service.loop.budget import Clock
 from es_service.loop.checks import (
     invalidate,
@@ -31,7 +31,7 @@ from es_service.loop.checks import (
     require_state,
     require_weights,
 )
-from es_service.loop.contents import Contents, Named, as_population
+from es_service.loop.contents import Named, StatePolicies, as_population
 from es_service.loop.evaluated import correct, policies_asked, told_of_asks, told_of_initial
 from es_service.loop.finished import Finished, Members, finish, reachable_in, rows
 from es_service.loop.generation import (
@@ -46,7 +46,7 @@ from es_service.loop.generation import (
 from es_service.loop.history import HistoryRow
 from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.state import RunState
-from es_service.protocol.episodes import DispatchCounts, Evaluator, Requests, Session, Value
+from es_service.protocol.episodes import DispatchCounts, Evaluator, OverlappedRequests, Requests, Value
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.novelty import novelty
@@ -59,7 +59,7 @@ def run(
     report: Callable[[HistoryRow], object],
     failed: Callable[[Sequence[str]], object] = lambda failures: None,
     counts: Callable[[], DispatchCounts] = DispatchCounts,
-) -> Session[tuple[RunState, str]]:
+) -> OverlappedRequests[tuple[RunState, str]]:
     """Run generations until the budget is spent or `report` returns a `Stop`. While the rollouts of one are computed,
     the one before is stored.
 
@@ -80,7 +80,7 @@ def run(
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
     state = begun = state or initial_state(search)
     reachable = reachable_in(search, state)
-    policies = Contents(store.content)
+    policies = StatePolicies(store.content)
     finished: list[Finished] = []
 
     def so_far() -> DispatchCounts:
@@ -126,7 +126,7 @@ def run(
     return state, record() or reason
 
 
-def drive(session: Session[Value], evaluator: Evaluator) -> Value:
+def drive(session: OverlappedRequests[Value], evaluator: Evaluator) -> Value:
     """What a session returns, whose work an evaluator computes.
 
     Raises:
@@ -179,7 +179,7 @@ def _reached(state: RunState) -> dict[str, float]:
 
 def generation(
     search: Search,
-    policies: Contents,
+    policies: StatePolicies,
     clock: Clock,
     state: RunState,
     counts: Callable[[], DispatchCounts] = DispatchCounts,
@@ -222,7 +222,7 @@ def generation(
 
 
 def propose(
-    search: Search, policies: Contents, state: RunState
+    search: Search, policies: StatePolicies, state: RunState
 ) -> tuple[SearchState, Mapping[int, int], Sequence[Ask | PolicyAsk]]:
     """What the next generation asks for: (the state in which centres have restarted from elites, the cells of these
     elites by index of the centre, the asks)."""

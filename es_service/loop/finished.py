@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.arrays import Changes, changes, new_names
+from es_service.loop.blocks import Changes, changes, new_names
 from es_service.loop.budget import MOST_DURATIONS, Clock, durations
 from es_service.loop.checks import require_known, require_storable
 from es_service.loop.contents import Named

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from es_service.loop.arrays import ARCHIVE, BEST, BLOCK, CENTRES, COUNTS, EXTRA, GEOMETRY, MAP, OBSERVATIONS, WEIGHT
+from es_service.loop.blocks import ARCHIVE, BEST, BLOCK, CENTRES, COUNTS, EXTRA, GEOMETRY, MAP, OBSERVATIONS, WEIGHT
 from es_service.protocol.content import OF_POLICY
 
 INTEGER, REAL, BOOL, NAMES = "iu", "f", "b", "V"

@@ -49,7 +49,7 @@ from es_service.search.maps.behaviour_map import empty_map, with_names
 from es_service.search.maps.geometry import make_geometry
 from es_service.search.steps import norm
 
-Result = TypeVar("Result", EpisodesResult, GradientResult)
+AnyResult = TypeVar("AnyResult", EpisodesResult, GradientResult)
 
 
 def initial_state(search: Search) -> RunState:
@@ -200,7 +200,7 @@ def episodes_of(
     return gathered([shape for _, shape in asked], results), moments
 
 
-def _computed(kind: type[Result], work: Sequence[Work]) -> Requests[list[Result]]:
+def _computed(kind: type[AnyResult], work: Sequence[Work]) -> Requests[list[AnyResult]]:
     """Results of chunks of one kind."""
     results = (yield work) if work else []
     checked = [result for result in results if isinstance(result, kind)]

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.episodes import METRICS
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
-from es_service.protocol.outputs import METRICS
 
 HistoryRow = dict[str, int | float | None]
 """Values by name of the column, as the loop writes them."""

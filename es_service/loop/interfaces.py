@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
-from es_service.loop.arrays import Changes
+from es_service.loop.blocks import Changes
 from es_service.loop.history import HistoryRow, Table
 from es_service.protocol.content import Arrays, Contents
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec

@@ -1,9 +1,12 @@
-"""Requests for episodes and their results, by address, however they were cut and put together."""
+"""Requests for episodes and their results, by address, however they were cut and put together; and the names of outputs
+that are computed only where a run names them, each of which is a named array of a result.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+import re
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
@@ -24,8 +27,36 @@ from es_service.protocol.messages import (
     Work,
     recipes_in,
 )
-from es_service.protocol.policies import POLICY_SLOTS, slots
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import POLICY_SLOTS, Recipes, slots
+
+METRICS = "metrics"
+"""Output with the metrics that a task records of an episode, [M]: those of `TaskSpec.metric_names`."""
+AT_THE_END = ("first_observation", "last_observation", "last_reward", "success", METRICS)
+"""Outputs with one value for each episode: the observation of its reset, and what there is after its last valid
+step."""
+OF_STEPS = ("observation", "action", "reward", "done", "step_descriptor")
+"""Outputs with a value for each valid step of an episode."""
+TRANSITIONS = (*OF_STEPS, "last_observation")
+"""What makes up the transitions of episodes: each step, and where the last one has led."""
+METRIC_FORM = "up to 40 letters, digits and _, a letter first"
+"""What the name of a metric must be, in words: one of a search, of a task, or of a program that runs a session."""
+
+
+TAKEN = ("last", "sum", "mean", "min", "max")
+"""What a metric of a config may take of the values that a key of `info` has in an episode."""
+NAME_OF_METRIC = "[A-Za-z][A-Za-z0-9_]{0,39}"
+"""Regular expression of METRIC_FORM."""
+CHOSEN_METRIC = f"^{NAME_OF_METRIC}(:({'|'.join(TAKEN)}))?$"
+"""Regular expression of a metric that a config chooses: KEY, or KEY:TAKEN."""
+
+
+def wrong_metric_names(names: Collection[object]) -> list[str]:
+    """Names that no metrics can have, or that differ from another one only in upper and lower case, as columns must
+    not."""
+    wrong = [repr(name) for name in names if not isinstance(name, str) or not re.fullmatch(NAME_OF_METRIC, name)]
+    folded = [str(name).casefold() for name in names]
+    return wrong or [repr(name) for name in names if folded.count(str(name).casefold()) > 1]
+
 
 ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
 """Arrays that every result has."""
@@ -145,7 +176,7 @@ Requests = Generator[Sequence[Work], list[ChunkResult], Value]
 Whoever drives it decides where the chunks are computed: an engine, the caller of `ask_tell`, or a test with a list.
 """
 
-Session = Generator[Sequence[Work] | None, list[ChunkResult] | None, Value]
+OverlappedRequests = Generator[Sequence[Work] | None, list[ChunkResult] | None, Value]
 """As `Requests`, but in two steps, so that the driver need not wait: it yields chunks to be sent, stores the generation
 before once it is resumed, yields None, and receives the results."""
 

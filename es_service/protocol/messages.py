@@ -18,12 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.options import Option, OptionValue, ParameterSpec
-from es_service.protocol.policies import Policies, PolicyChunk
+from es_service.protocol.policies import FloatArray, Policies, PolicyChunk, Recipes
 from es_service.protocol.policy_spec import PolicySpec
-from es_service.protocol.recipes import Recipes
 from es_service.protocol.sources import task_code
 
-FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
 TaskKind = Literal["jax", "python", "function", "caller"]

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.content import Cache
 from es_service.protocol.messages import FloatArray, Work, recipes_in
-from es_service.protocol.policies import Policies
-from es_service.protocol.recipes import Origin, Recipes, name_of, recipes_again
+from es_service.protocol.policies import Origin, Policies, Recipes, name_of, recipes_again
 
 Value = TypeVar("Value")
 

@@ -23,11 +23,11 @@ from es_service.errors import ConfigError
 from es_service.report import statistics
 from es_service.report.compare import Group, runs_of
 from es_service.report.data import RunData
-from es_service.report.facts import number
 from es_service.report.markup import Markup, table, tag
 from es_service.report.measures import Measure, chosen
 from es_service.report.page import section
 from es_service.report.statistics import Difference
+from es_service.report.summary import number
 from es_service.runs.selection import LEVEL
 
 FORMATS = (".json", ".csv", ".tex")

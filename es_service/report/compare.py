@@ -17,10 +17,10 @@ from es_service.config.resolution import LEFT_OPEN
 from es_service.config.text import did_you_mean, in_line, nearest, unknown_name
 from es_service.errors import ConfigError
 from es_service.report import statistics
-from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
 from es_service.report.measures import CERTIFIED, GAP, SUCCESS, as_compared, has_curve, measures
 from es_service.report.series import X_AXES, Chart, Line, axes_of
+from es_service.report.statistics import median_interval
 from es_service.runs.sweep_plan import ENVIRONMENT, settings_words
 
 POINTS = 200

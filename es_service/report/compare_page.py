@@ -9,15 +9,15 @@ import numpy as np
 
 from es_service.errors import NotInRunError, counted
 from es_service.report import between, compare, maps
-from es_service.report.bootstrap import WHOLE_RANGE, coverage
 from es_service.report.compare import Group, Quartiles, Summary
 from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
-from es_service.report.facts import number
 from es_service.report.markup import Markup, joined, table, tables, tag, value_range
 from es_service.report.measures import CERTIFIED, measure_named, measures
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
+from es_service.report.statistics import WHOLE_RANGE, coverage
+from es_service.report.summary import number
 from es_service.runs.run_status import state
 
 VALUES = {CERTIFIED: "certified value", "best_fitness": "best fitness"}

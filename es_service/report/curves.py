@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.report.facts import number
 from es_service.report.markup import Frame, Markup, joined, spread, table, tag, tick_text, ticks
 from es_service.report.series import X_AXES, Chart, lone
+from es_service.report.summary import number
 
 WIDTH, HEIGHT = 560, 250
 STYLES = 7

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
-from es_service.loop.arrays import BEST, MAP, joined, value_of
+from es_service.loop.blocks import BEST, MAP, joined, value_of
 from es_service.loop.forms import problem
 from es_service.loop.history import evaluated_nouns
-from es_service.protocol.content import as_bytes
+from es_service.protocol.content import Arrays, as_bytes
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.report.measures import as_compared, with_derived
@@ -31,7 +31,7 @@ from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
-from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
+from es_service.store.sound import Followed, SoundRun, read_sound
 
 TRACE = "trace_T_B"
 

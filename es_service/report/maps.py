@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from es_service.report import floor
 from es_service.report.curves import axis_lines
 from es_service.report.data import RunData
-from es_service.report.facts import number
 from es_service.report.floor import Range, detours
 from es_service.report.markup import LEVELS, SCALE, Frame, Markup, joined, level, packed, spread, tag, value_range
+from es_service.report.summary import number
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import Cvt, Grid, intervals
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from es_service.errors import counted
 from es_service.protocol.options import FREE
-from es_service.report import curves, facts, floor, maps, series
+from es_service.report import curves, floor, maps, series, summary
 from es_service.report.data import RunData
-from es_service.report.facts import changed_settings, number
 from es_service.report.markup import SCALE, Frame, Markup, data_script, level, packed, spread, table, tag, value_range
+from es_service.report.summary import changed_settings, number
 
 # All evaluated centres, or policies, as a cloud of points, with a slider over the generations.
 #
@@ -182,15 +182,15 @@ def _head(data: RunData) -> Markup:
     problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
     return tag(
         "section",
-        tag("p", facts.verdict(data), class_="verdict"),
+        tag("p", summary.verdict(data), class_="verdict"),
         *problems,
         tag(
             "div",
-            tag("div", tag("h2", "What was run"), table(facts.what_was_run(data))),
+            tag("div", tag("h2", "What was run"), table(summary.what_was_run(data))),
             tag("div", tag("h2", "Settings that differ from their defaults"), settings),
             class_="columns",
         ),
-        tag("details", tag("summary", "Versions, machine and digest"), table(facts.provenance(data)), open="open"),
+        tag("details", tag("summary", "Versions, machine and digest"), table(summary.provenance(data)), open="open"),
         id="what",
     )
 
@@ -296,11 +296,11 @@ def _parameters(data: RunData) -> Markup:
 def _time(data: RunData) -> Markup:
     x_K, phases = series.phase_curves(data.history)
     figure = curves.phase_figure(series.phase_seconds(data.history), x_K, phases)
-    return section("Where the time went", tag("p", facts.time_sentence(data)), figure, id_="time")
+    return section("Where the time went", tag("p", summary.time_sentence(data)), figure, id_="time")
 
 
 def _faults(data: RunData) -> Markup:
-    faults = facts.faults(data)
+    faults = summary.faults(data)
     rows = [
         (f"{fault.generation:,}", f"{fault.lost_workers:,}", f"{fault.retries:,}") for fault in faults[:MOST_FAULTS]
     ]
@@ -308,4 +308,4 @@ def _faults(data: RunData) -> Markup:
     if len(faults) > MOST_FAULTS:
         more = tag("p", f"{len(faults) - MOST_FAULTS:,} more generations are not listed.", class_="note")
     listed = table(rows, ("generation", "workers lost", "chunks sent again"), "numbers") if rows else None
-    return section("Faults survived", tag("p", facts.fault_sentence(faults)), listed, more, id_="faults")
+    return section("Faults survived", tag("p", summary.fault_sentence(faults)), listed, more, id_="faults")

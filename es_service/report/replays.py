@@ -17,9 +17,9 @@ from es_service.protocol.recordings import Mesh, Scene, Shape
 from es_service.protocol.sources import task_code, user_path
 from es_service.report import floor
 from es_service.report.data import RunData
-from es_service.report.facts import number
 from es_service.report.markup import Markup, packed, spread, tag
 from es_service.report.page import asset, section
+from es_service.report.summary import number
 from es_service.runs.replay import CERTIFIED, Replay, record
 
 MOST_CELLS = 8

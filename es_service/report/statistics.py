@@ -1,14 +1,16 @@
-"""Statistics between groups of runs: averages with intervals, and how likely one group is better than another.
+"""Statistics of groups of runs: averages with intervals, and how likely one group is better than another.
 
 The measures are those of Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS
 2021, and its package rliable). A group has for each task an array of the values of its runs, [R]; greater values are
 better. A value may be infinite, such as minus the cost of a run that never reached its target; then there is no mean.
 
-Intervals are percentile bootstraps in which the runs of each task are drawn anew, with repetitions. If there are few
-enough ways to draw them, all are counted, otherwise DRAWS are drawn by a generator with a fixed seed: the same values
-always have the same interval.
+Intervals are percentile bootstraps (Efron, Annals of Statistics 7, 1979) in which the runs of each task are drawn anew,
+with repetitions. If there are few enough ways to draw them, all are counted, otherwise DRAWS are drawn by a generator
+with a fixed seed: the same values always have the same interval. For the median over the seeds of one task, all n^n
+ways to draw n of them are always counted.
 
-Axes: R runs of a task, W ways to draw them, K thresholds.
+Axes: R runs of a task, W ways to draw them, K thresholds or points of a curve, M pairs of runs between which a median
+can lie.
 """
 
 from __future__ import annotations
@@ -23,8 +25,61 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from es_service.report.bootstrap import median_interval
 from es_service.runs.selection import LEVEL
+
+WHOLE_RANGE = 5
+"""With at most so many seeds, the interval reaches from the lowest to the highest value."""
+
+
+def median_interval(y_R_K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Interval of the median over at least two runs, (low, high) at each point [2, K]; NaN where a run has no value."""
+    lower_M, upper_M, share_M = _medians(len(y_R_K))
+    sorted_R_K = np.sort(y_R_K, axis=0)
+    median_M_K = (sorted_R_K[lower_M] + sorted_R_K[upper_M]) / 2
+    order_M_K = np.argsort(median_M_K, axis=0, kind="stable")
+    share_M_K = share_M[order_M_K]
+    tail = (1 - LEVEL) / 2 * (1 - 1e-12)
+    first_K = np.argmax(np.cumsum(share_M_K, axis=0) >= tail, axis=0)
+    last_K = len(share_M) - 1 - np.argmax(np.cumsum(share_M_K[::-1], axis=0) >= tail, axis=0)
+    ends_2_K = np.take_along_axis(order_M_K, np.stack([first_K, last_K]), axis=0)
+    found_2_K = np.take_along_axis(median_M_K, ends_2_K, axis=0)
+    return np.where(np.isnan(y_R_K).any(axis=0), np.nan, found_2_K)
+
+
+def coverage(seeds: int) -> float:
+    """Probability that the lowest and the highest of so many values hold the median of all possible seeds between them.
+
+    It is that of not having all values on one side, whatever their distribution (Thompson, Annals of Mathematical
+    Statistics 7, 1936).
+    """
+    return 1 - 2.0 ** (1 - seeds)
+
+
+@cache
+def _medians(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """The medians of all n^n ways to draw n values, as the ranks of the two middle values and the share of the ways.
+
+    Both middle values are the same one if n is odd.
+    """
+    half, is_even = (n + 1) // 2, n % 2 == 0
+
+    def above_half(i: int) -> int:
+        """Ways to draw more than half of the values among the i least: both middle values are among them."""
+        return sum(comb(n, drawn) * i**drawn * (n - i) ** (n - drawn) for drawn in range(n // 2 + 1, n + 1))
+
+    below = [above_half(i) for i in range(n + 1)]
+    count = {(i, i): below[i] - below[i - 1] for i in range(1, n + 1)}
+    if is_even:
+        # One half of the draws has its greatest at i, the other half its least at j.
+        greatest = [i**half - (i - 1) ** half for i in range(1, n + 1)]
+        for j in range(1, n + 1):
+            least = comb(n, half) * ((n - j + 1) ** half - (n - j) ** half)
+            count[j, j] -= least * (j - 1) ** half  # the lower middle value is less than j
+            for i in range(1, j):
+                count[i, j] = least * greatest[i - 1]
+    ranks_M_2 = np.array(list(count)) - 1
+    return ranks_M_2[:, 0], ranks_M_2[:, 1], np.array([number / n**n for number in count.values()])
+
 
 MOST_COUNTED = 20_000
 """Most ways to draw runs, or to share them out between two groups, that are all counted."""
@@ -33,9 +88,9 @@ TRIM = 0.25
 """Share of the values that an interquartile mean leaves out at each end."""
 
 Array = NDArray[np.float64]
-Values = Sequence[Array]
+TaskValues = Sequence[Array]
 """Values of the runs of a group, an array for each task."""
-Measure = Callable[[Values], Any]
+Statistic = Callable[[TaskValues], Any]
 """A number of each way [W] to draw runs, from their values [W, R] of each task."""
 
 
@@ -56,18 +111,18 @@ class Difference(NamedTuple):
     """The smallest p that so many runs can have."""
 
 
-def median(values: Values) -> Any:
+def median(values: TaskValues) -> Any:
     """The median of the values of all tasks, [W]."""
     return np.median(np.concatenate(values, axis=-1), axis=-1)
 
 
-def iqm(values: Values) -> Any:
+def iqm(values: TaskValues) -> Any:
     """The interquartile mean of the values of all tasks, [W]: the mean without a quarter of them, rounded down, at each
     end."""
     return stats.trim_mean(np.concatenate(values, axis=-1), TRIM, axis=-1)
 
 
-def interval(measure: Measure, values: Values) -> tuple[float, float] | None:
+def interval(measure: Statistic, values: TaskValues) -> tuple[float, float] | None:
     """Bootstrap interval of a measure at LEVEL, (low, high); None if a task has less than two runs."""
     if min(map(len, values)) < 2:
         return None
@@ -75,7 +130,7 @@ def interval(measure: Measure, values: Values) -> tuple[float, float] | None:
     return _percentiles(np.asarray(measure(drawn), float), share_W)
 
 
-def interval_of_median(values: Values) -> tuple[float, float] | None:
+def interval_of_median(values: TaskValues) -> tuple[float, float] | None:
     """As `interval` of the median; with one task, all ways to draw its runs are counted, however many there are."""
     if len(values) > 1 or len(values[0]) < 2:
         return interval(median, values)
@@ -83,12 +138,12 @@ def interval_of_median(values: Values) -> tuple[float, float] | None:
     return low, high
 
 
-def profile(values: Values, threshold_K: Array) -> Array:
+def profile(values: TaskValues, threshold_K: Array) -> Array:
     """Performance profile [K]: the share of runs with at least each threshold, averaged over tasks."""
     return np.mean([(task[:, None] >= threshold_K).mean(axis=0) for task in values], axis=0)
 
 
-def profile_interval(values: Values, threshold_K: Array) -> Array | None:
+def profile_interval(values: TaskValues, threshold_K: Array) -> Array | None:
     """Bootstrap interval of a performance profile at each threshold by itself, (low, high) [2, K]; see `interval`."""
     ends = [
         interval(lambda drawn, at=at: np.mean([(x >= at).mean(axis=-1) for x in drawn], axis=0), values)
@@ -97,13 +152,13 @@ def profile_interval(values: Values, threshold_K: Array) -> Array | None:
     return None if None in ends else np.array(ends, float).T
 
 
-def improvement(first: Values, second: Values) -> Any:
+def improvement(first: TaskValues, second: TaskValues) -> Any:
     """Probability that a run of the first group has a greater value than one of the second, [W], averaged over tasks;
     of equal values half (Vargha and Delaney, Journal of Educational and Behavioral Statistics 25, 2000)."""
     return np.mean([_greater(x, y) for x, y in zip(first, second, strict=True)], axis=0)
 
 
-def difference(first: Values, second: Values, *, paired: bool = False) -> Difference:
+def difference(first: TaskValues, second: TaskValues, *, paired: bool = False) -> Difference:
     """How the first group differs from the second.
 
     Args:
@@ -156,7 +211,7 @@ def _gap(x: Array, y: Array) -> Array:
         return np.where(x == y, 0.0, x - y)
 
 
-def _share_above(gaps: Values) -> Any:
+def _share_above(gaps: TaskValues) -> Any:
     """Share of pairs with a positive gap, averaged over tasks, [W]; a gap of 0 counts half."""
     return np.mean([0.5 + np.sign(gap).mean(axis=-1) / 2 for gap in gaps], axis=0)
 
@@ -172,7 +227,7 @@ def _shift(x: Array, y: Array, paired: bool) -> float:
     return float(np.median(gaps))
 
 
-def _rank_test(first: Values, second: Values) -> tuple[float, float]:
+def _rank_test(first: TaskValues, second: TaskValues) -> tuple[float, float]:
     """(two-sided p of Mann and Whitney's test, over tasks of the mean probability of improvement; the smallest)."""
     ways = [comb(len(x) + len(y), len(x)) for x, y in zip(first, second, strict=True)]
     smallest = min(1.0, 2 / prod(ways))
@@ -198,7 +253,7 @@ def _rank_test(first: Values, second: Values) -> tuple[float, float]:
     return float(is_as_uneven_W.mean() if is_counted else (1 + is_as_uneven_W.sum()) / (1 + DRAWS)), smallest
 
 
-def _sign_test(gaps: Values) -> tuple[float, float]:
+def _sign_test(gaps: TaskValues) -> tuple[float, float]:
     """(two-sided p of Wilcoxon's signed-rank test, over the pairs of all tasks; the smallest that it can be)."""
     gap = np.concatenate(gaps)
     smallest = min(1.0, 2.0 ** (1 - len(gap)))
@@ -231,7 +286,7 @@ def _ways_to_draw(runs: int) -> tuple[NDArray[np.intp], Array]:
     return ways, orders / orders.sum()
 
 
-def _drawn(values: Values, seed: int = 0) -> tuple[list[Array], Array]:
+def _drawn(values: TaskValues, seed: int = 0) -> tuple[list[Array], Array]:
     """Values of drawn runs [W, R] of each task, and the share of each way [W]."""
     sizes = [len(task) for task in values]
     if prod(comb(2 * size - 1, size) for size in sizes) <= MOST_COUNTED:

@@ -13,11 +13,11 @@ from es_service.protocol.machine import given_path
 from es_service.report import between, compare, curves, maps, series
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
-from es_service.report.facts import verdict
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.markup import tag, value_range
 from es_service.report.page import EvaluateText, document, run_page, run_title
 from es_service.report.replays import MOST_CELLS, replay_section
+from es_service.report.summary import verdict
 from es_service.runs.run_status import state
 from es_service.runs.view import Run
 

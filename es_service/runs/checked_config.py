@@ -22,9 +22,9 @@ from es_service.config.text import show
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import LATER, Column, evaluated_columns, history_columns
+from es_service.protocol.episodes import METRIC_FORM, wrong_metric_names
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import defaults_of
-from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.runs.identity import require_unchanged
 from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.view import open_run

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.errors import NotInRunError, WayOut
-from es_service.loop.arrays import BEST, CENTRES, OBSERVATIONS
+from es_service.loop.blocks import BEST, CENTRES, OBSERVATIONS
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.state import merge_moments, moments_of
 from es_service.protocol.content import Policy

@@ -27,9 +27,8 @@ from es_service.logs import logger
 from es_service.loop.checks import valid_members
 from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import require_same_process
-from es_service.protocol.episodes import gathered
+from es_service.protocol.episodes import TRANSITIONS, gathered
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
-from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.engine import make_engine, reader_of_reports
 from es_service.runs.session import initial_policy

@@ -20,7 +20,7 @@ from es_service.config.tasks import task_of
 from es_service.config.text import show
 from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError, NotInRunError, Problem
-from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, names_of, state_of, stored, value_of
+from es_service.loop.blocks import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, names_of, state_of, stored, value_of
 from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Policy
 from es_service.protocol.messages import Moments

@@ -30,10 +30,9 @@ from es_service.loop import driver
 from es_service.loop.history import METRIC, evaluated_word
 from es_service.loop.interfaces import Stop
 from es_service.loop.state import no_observations
-from es_service.protocol.episodes import DispatchCounts, Session
+from es_service.protocol.episodes import METRIC_FORM, DispatchCounts, OverlappedRequests, wrong_metric_names
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
-from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.runs.engine import make_engine, reader_of_reports
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
@@ -89,7 +88,7 @@ def work(
     *,
     strict: bool = False,
     told: Told | None = None,
-) -> Session[Outcome]:
+) -> OverlappedRequests[Outcome]:
     """Run generations until the budget is spent or `on_generation` returns a `Stop`. The configured engine computes
     their work, so that nothing is yielded, unless the caller does.
 

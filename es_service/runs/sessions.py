@@ -22,7 +22,7 @@ from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
 from es_service.loop.interfaces import Stop
 from es_service.protocol.content import Policy
-from es_service.protocol.episodes import Session
+from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import require_no_import_of_a_task
 from es_service.runs.certification import NamedPolicy, add_certified, different, opened, platform_of, workers_for
@@ -217,7 +217,7 @@ def create_run(
     beginning: Beginning,
     again: WayOut,
     listener: Listener,
-) -> Session[Outcome]:
+) -> OverlappedRequests[Outcome]:
     """Create a run and work on it; yields as `session.work`. If no worker can be started, there is no run afterwards.
 
     Args:
@@ -273,7 +273,7 @@ def continue_run(
     asked: Mapping[str, Any] = MappingProxyType({}),
     *,
     strict: bool = False,
-) -> Session[Outcome]:
+) -> OverlappedRequests[Outcome]:
     """Continue a run, in as many sessions as `budget.target_certified` makes of it; yields as `session.work`.
 
     Args:
@@ -283,7 +283,7 @@ def continue_run(
     return (yield from _to_target(config, outcome, listener, strict=strict))
 
 
-def outcome_of(session: Session[Outcome]) -> Outcome:
+def outcome_of(session: OverlappedRequests[Outcome]) -> Outcome:
     """What a session returns, for which an engine computes."""
     try:
         next(session)
@@ -292,7 +292,9 @@ def outcome_of(session: Session[Outcome]) -> Outcome:
     raise AssertionError("a session with an engine has asked its caller")
 
 
-def _to_target(config: RunConfig, outcome: Outcome, listener: Listener, *, strict: bool = False) -> Session[Outcome]:
+def _to_target(
+    config: RunConfig, outcome: Outcome, listener: Listener, *, strict: bool = False
+) -> OverlappedRequests[Outcome]:
     """Certify the best centre whenever a session has ended for that, and continue: if it reaches the target, no longer
     than until the next session has opened the run."""
     while outcome.reason == TO_CERTIFY:
@@ -308,7 +310,7 @@ def _session(
     asked: Mapping[str, Any] = MappingProxyType({}),
     *,
     strict: bool = False,
-) -> Session[tuple[RunConfig, Outcome]]:
+) -> OverlappedRequests[tuple[RunConfig, Outcome]]:
     """Open a run, check that the config of this session fits it, and work on it."""
     opened = when_free(partial(RunStore.open, folder, hook=listener.hook), telling_once(folder, listener.on_notice))
     with opened as store, in_run(store.meta.run_id):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from es_service.config.resolution import policy_of
 from es_service.errors import NotInRunError, StoreError
-from es_service.loop.arrays import ARCHIVE, BEST, MAP, OBSERVATIONS, Nodes, centre_path, joined, value_of
+from es_service.loop.blocks import ARCHIVE, BEST, MAP, OBSERVATIONS, Tree, centre_path, joined, value_of
 from es_service.loop.contents import stored_elite, stored_policy
 from es_service.loop.forms import INTEGER, REAL, Sizes, missing, policy_problem, problem
 from es_service.loop.state import Best, statistics_in_force
@@ -75,7 +75,7 @@ def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:
     return meta
 
 
-def sound_nodes(folder: Path, meta: RunMeta, blocks: Nodes, wanted: Collection[str] = ("",)) -> dict[str, Arrays]:
+def sound_nodes(folder: Path, meta: RunMeta, blocks: Tree, wanted: Collection[str] = ("",)) -> dict[str, Arrays]:
     """The nodes of a state, of its blocks.
 
     Args:
@@ -180,7 +180,7 @@ class Snapshot:
     folder: Path
     meta: RunMeta
     generation: int
-    nodes: Nodes
+    nodes: Tree
     """Arrays of the nodes of its state, or of those that were wanted."""
     contents: Contents = field(default_factory=dict)
     """The policies and traces that were wanted, by their names."""

@@ -17,7 +17,7 @@ from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop import driver
 from es_service.loop.budget import Clock
-from es_service.loop.contents import Contents
+from es_service.loop.contents import StatePolicies
 from es_service.loop.finished import Finished, reachable_in, rows
 from es_service.loop.generation import initial_state
 from es_service.loop.history import HistoryRow, Table
@@ -136,7 +136,7 @@ def _recompute(
     """The generation that was reached, and what differs in it."""
     stored = _Comparison(run, begin)
     state = driver.stored_state(stored) or initial_state(search)
-    policies, clock, reachable = Contents(stored.content), Clock(0.0), reachable_in(search, state)
+    policies, clock, reachable = StatePolicies(stored.content), Clock(0.0), reachable_in(search, state)
     while True:
         requests = driver.generation(search, policies, clock, state)
         finished = completed(requests, evaluator.evaluate)

@@ -14,7 +14,7 @@ import numpy as np
 from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.config.text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
-from es_service.loop.arrays import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, Nodes, names_of
+from es_service.loop.blocks import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, Tree, names_of
 from es_service.protocol.machine import given_path
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.options import ParameterSpec
@@ -144,7 +144,7 @@ class Run:
         """
         snapshots: list[Snapshot] = []
 
-        def named_by(at: int, blocks: Nodes) -> Iterable[bytes]:
+        def named_by(at: int, blocks: Tree) -> Iterable[bytes]:
             nodes = sound_nodes(self.folder, self.meta, blocks, wanted)
             snapshots.append(Snapshot(self.folder, self.meta, at, nodes))
             return named(snapshots[-1])

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
-from es_service.loop.arrays import Changes
+from es_service.loop.blocks import Changes
 from es_service.loop.history import HistoryRow, Table
 from es_service.protocol.content import Arrays, Contents
 from es_service.runs.identity import Recorder
@@ -32,11 +32,11 @@ again for a request to stop."""
 AGAIN_S = 0.5
 """Least seconds between two attempts to store what waits in memory."""
 
-Result = TypeVar("Result")
+Value = TypeVar("Value")
 _Generation = tuple[int, Changes, HistoryRow, Table, Contents, Mapping[str, float]]
 
 
-def when_free(act: Callable[[], Result], held: Callable[[], object]) -> Result:
+def when_free(act: Callable[[], Value], held: Callable[[], object]) -> Value:
     """What `act` returns when no other program holds the database; `held` is called before each further attempt."""
     while True:
         try:

@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 
 from es_service.errors import StoreError, WayOut
-from es_service.loop.arrays import BLOCK, MAP
+from es_service.loop.blocks import BLOCK, MAP
 from es_service.protocol.content import name_of
 from es_service.protocol.machine import is_mixed
 from es_service.store.codec import column_bytes, decode_part, row_bytes

@@ -28,7 +28,7 @@ from pydantic import StringConstraints
 
 from es_service.loop.history import METRIC
 from es_service.protocol.content import Contents
-from es_service.protocol.outputs import NAME_OF_METRIC
+from es_service.protocol.episodes import NAME_OF_METRIC
 from es_service.store.codec import Part, decode_part, encode_part, text_sha256
 from es_service.store.facts import Damaged, Finite, Natural, Platform, facts, require_form
 from es_service.store.rows import Columns

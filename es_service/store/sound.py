@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from es_service.errors import StoreError
+from es_service.protocol.content import Arrays
 from es_service.store.codec import row_dict
 from es_service.store.facts import GENERATION, Damaged
 from es_service.store.folder import COPY
@@ -25,7 +24,6 @@ from es_service.store.rows import Columns, GrowingTable, StoredRow, history_rows
 from es_service.store.schema import RunMeta
 from es_service.store.states import kept_rows, newest_state, rows_in_force, sound_content, sound_part, whole_states
 
-Arrays = dict[str, NDArray[Any]]
 Keep = Callable[[RunMeta, str, Arrays], Arrays | None]
 """Function (the run, name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part. It raises
 ValueError for arrays that the run cannot have."""

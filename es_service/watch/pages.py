@@ -12,11 +12,11 @@ from typing import Any
 from es_service.errors import ServiceError, counted
 from es_service.report.compare_page import comparison_sections
 from es_service.report.data import RunData
-from es_service.report.facts import elsewhere_text, number
 from es_service.report.maps import empty_pattern
 from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
+from es_service.report.summary import elsewhere_text, number
 from es_service.runs.replay import CERTIFIED
 from es_service.runs.run_status import FAULTS_OF, read_recent, state
 from es_service.watch.channels import Picture

@@ -38,7 +38,7 @@ from workers.simd.episodes.check import check_resets
 from workers.simd.episodes.hidden import plan
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.network import policy_function
-from workers.simd.episodes.noise import fill_function
+from workers.simd.episodes.noise_kernels import fill_function
 from workers.simd.episodes.rollout import always_zero
 from workers.simd.frontend.trace import trace_jaxpr
 

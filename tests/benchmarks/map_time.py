@@ -24,7 +24,7 @@ from es_service import api
 from es_service.config.tasks import task_of
 from es_service.config.workload import policy_spec
 from es_service.loop import driver
-from es_service.loop.arrays import state_of, stored
+from es_service.loop.blocks import state_of, stored
 from es_service.loop.history import history_columns
 from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Arrays, Policy, name_of, names

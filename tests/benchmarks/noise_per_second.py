@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
-from workers.rollout import make_gradient_sum
 from workers.simd.episodes import rollout as simd
+from workers.xla import make_gradient_sum
 
 PAIRS = 64
 UNIT = np.float32(1 / NORMAL_STD)

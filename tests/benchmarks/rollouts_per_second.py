@@ -173,7 +173,7 @@ def not_looking() -> Iterator[None]:
 
     with (
         patch("workers.simd.episodes.program.episode_steps", blind_steps),
-        patch("workers.rollout.episode_steps", blind_steps),
+        patch("workers.xla.episode_steps", blind_steps),
         patch("workers.simd.episodes.compiled._all_finite", lambda words: True),
         patch("workers.rollouts.jax_tasks.judged", lambda functions, spec: functions),
     ):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from es_service.loop import forms
-from es_service.loop.arrays import BLOCK_BYTES, changes, joined, state_of, stored, value_of
+from es_service.loop.blocks import BLOCK_BYTES, changes, joined, state_of, stored, value_of
 from es_service.loop.state import NO_BEST, RunState
 from es_service.protocol.messages import Moments
 from es_service.search.algorithms.base import frozen

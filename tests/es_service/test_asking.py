@@ -13,9 +13,9 @@ from es_service.asking import Asked
 from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, EvaluationError
-from es_service.loop.arrays import OBSERVATIONS, value_of
+from es_service.loop.blocks import OBSERVATIONS, value_of
 from es_service.protocol.messages import Moments
-from es_service.report.facts import changed_settings
+from es_service.report.summary import changed_settings
 from es_service.runs.lineage import polish_config
 from es_service.store.digest import digest_parts
 from tests.examples import late_answers, own_loop

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from es_service.errors import EvaluationError
-from es_service.loop.contents import Contents
+from es_service.loop.contents import StatePolicies
 from es_service.protocol.content import Policy, name_of, names, policy_of
+from es_service.protocol.policies import IsoLine, recipes_of
 from es_service.protocol.policy_spec import PolicySpec
-from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import PolicyAsk
 
 KILOBYTE = 1024
@@ -40,7 +40,7 @@ def values(contents, *numbers):
 
 
 def test_a_policy_that_was_read_needs_no_other_reading_until_there_is_no_room(store):
-    contents = Contents(store.content, most_bytes=3 * KILOBYTE)
+    contents = StatePolicies(store.content, most_bytes=3 * KILOBYTE)
     for number in (0, 1, 2, 0, 3, 0, 2, 1):
         assert values(contents, number) == [number]
     assert store.read == [0, 1, 2, 3, 1]  # 1 was not asked for the longest
@@ -48,7 +48,7 @@ def test_a_policy_that_was_read_needs_no_other_reading_until_there_is_no_room(st
 
 def test_of_a_map_larger_than_the_room_only_the_rest_is_read_again(store):
     """As a batch of mutants asks for it, generation after generation."""
-    contents = Contents(store.content, most_bytes=3 * KILOBYTE)
+    contents = StatePolicies(store.content, most_bytes=3 * KILOBYTE)
     for _ in range(3):
         assert values(contents, 0, 1, 2, 3, 4, 4) == [0, 1, 2, 3, 4]
     assert store.read == [0, 1, 2, 3, 4, *(3, 4) * 2]
@@ -59,13 +59,13 @@ def test_of_a_map_larger_than_the_room_only_the_rest_is_read_again(store):
 
 def test_a_policy_larger_than_the_room_is_read_each_time(store):
     store.contents[bytes([0])] = content(0, kilobytes=4)
-    contents = Contents(store.content, most_bytes=3 * KILOBYTE)
+    contents = StatePolicies(store.content, most_bytes=3 * KILOBYTE)
     assert [values(contents, number) for number in (0, 0, 1, 1)] == [[0], [0], [1], [1]]
     assert store.read == [0, 0, 1]
 
 
 def test_those_of_the_newest_generation_need_not_be_stored_yet(store):
-    contents = Contents(store.content)
+    contents = StatePolicies(store.content)
     contents.add({bytes([9]): content(9)}, {})
     assert values(contents, 0, 9) == [0, 9]
     contents.add({}, {})
@@ -76,7 +76,7 @@ def test_those_of_the_newest_generation_need_not_be_stored_yet(store):
 
 
 def test_policies_are_read_only(store):
-    contents = Contents(store.content)
+    contents = StatePolicies(store.content)
     with pytest.raises(ValueError, match="read-only"):
         contents.of([bytes([0])])[bytes([0])]["parameters_D"][0] = 1
 
@@ -90,17 +90,17 @@ def test_policies_that_are_asked_for_by_name_get_their_parameters_and_statistics
     policies = [policy(value) for value in (1, 2)]
     store.contents = {name_of(content): content for content in policies}
     named = names(map(name_of, policies))
-    (asked,) = Contents(store.content).completed((PolicyAsk(named[[1, 0, 1]]),), 3)
+    (asked,) = StatePolicies(store.content).completed((PolicyAsk(named[[1, 0, 1]]),), 3)
     np.testing.assert_array_equal(asked.parameters_N_D.made(), np.repeat([[2], [1], [2]], 6, axis=1))
     np.testing.assert_array_equal(asked.observation_mean_N_O, [[2, 2], [1, 1], [2, 2]])
     recipes = recipes_of(IsoLine(0.0, 0.0), named, np.array([[0, 1]]), np.zeros((1, 4), np.uint32))
-    (asked,) = Contents(store.content).completed((PolicyAsk(recipes),), 3)
+    (asked,) = StatePolicies(store.content).completed((PolicyAsk(recipes),), 3)
     np.testing.assert_array_equal(asked.parameters_N_D.made(), np.ones((1, 6)))
 
 
 def test_a_policy_that_nobody_has_is_named(store):
     with pytest.raises(EvaluationError, match=r"generation 3: `ask` names the policy 07070707.*nothing in the state"):
-        Contents(store.content).completed((PolicyAsk(names([bytes([7] * 32)])),), 3)
+        StatePolicies(store.content).completed((PolicyAsk(names([bytes([7] * 32)])),), 3)
 
 
 def test_a_name_is_that_of_the_content_alone():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.cluster.vq import kmeans2
 
 from es_service import api
-from es_service.loop.arrays import GEOMETRY
+from es_service.loop.blocks import GEOMETRY
 from es_service.loop.forms import Sizes, problem
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.maps import geometry as geometries

@@ -24,8 +24,8 @@ from es_service.dispatch.staying import staying
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
+from es_service.protocol.policies import Recipes
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.recipes import Recipes
 from es_service.protocol.sent import LEAST_BYTES, Received
 from es_service.protocol.user_code import RaisedError
 from es_service.protocol.wire import framed, receive

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from es_service import open_run
-from es_service.loop.arrays import names_of, state_of, stored
+from es_service.loop.blocks import names_of, state_of, stored
 from es_service.report.data import read_run
 from es_service.runs.export import tables
 from es_service.search.novelty import archive_of

@@ -5,8 +5,8 @@ import re
 
 from es_service import open_run
 from es_service.report.data import read_run
-from es_service.report.facts import verdict
 from es_service.report.maps import draw_map
+from es_service.report.summary import verdict
 from tests.database import execute
 from tests.es_service.test_report_page import Elements
 from tests.run_examples import write_run

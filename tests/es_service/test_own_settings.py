@@ -13,7 +13,7 @@ from es_service import api
 from es_service.config import search
 from es_service.config.text import parse_value
 from es_service.errors import ConfigError
-from es_service.report.facts import changed_settings
+from es_service.report.summary import changed_settings
 from es_service.runs.checked_config import changed_config, changes_from
 from es_service.runs.sweep_plan import plan
 from tests.es_service.config_examples import MINIMAL, POINT_MAZE, left_out

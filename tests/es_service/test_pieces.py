@@ -13,8 +13,7 @@ from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.episodes import gathered, pieces_of, together
 from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, evaluation_chunks, with_subject
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.policies import POLICY_SLOTS
-from es_service.protocol.recipes import IsoLine, recipes_of
+from es_service.protocol.policies import POLICY_SLOTS, IsoLine, recipes_of
 from tests.helpers import centre, random_parameters, spec
 from workers.worker import make_worker
 

@@ -32,7 +32,7 @@ from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, e
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, Work, with_subject
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import Recipes
 from es_service.protocol.sent import LEAST_BYTES, Received
 from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters

@@ -15,10 +15,10 @@ from es_service.report import compare, figures
 from es_service.report import maps as several_maps
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
-from es_service.report.facts import number
 from es_service.report.figures import draw_overview, empty_figure, write_figures
 from es_service.report.floor import beside_walls
 from es_service.report.markup import MOST_COLUMNS
+from es_service.report.summary import number
 from es_service.report.write import write_comparison, write_report
 from es_service.runs.run_status import GROUPS, INSIDE, write_groups
 from es_service.search.maps.behaviour_map import BehaviourMap

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from es_service.cli.main import app
 from es_service.errors import StoreError
 from es_service.protocol.machine import CODE, code_text
-from es_service.report import facts, series
+from es_service.report import series, summary
 from es_service.report.data import read_run
 from es_service.runs.view import open_run
 from es_service.store.sound import read_sound
@@ -42,14 +42,14 @@ def test_a_report_reads_what_other_readers_read(folder):
 
 def test_settings_are_shown_if_they_differ_and_not_if_they_follow(folder):
     """search.pairs changes the chunks, too; task, algorithm, seed and budget are shown elsewhere."""
-    found = facts.changed_settings(open_run(folder).config, POINT)
+    found = summary.changed_settings(open_run(folder).config, POINT)
     assert [tuple(one) for one in found] == [("search.pairs", "64", "512"), ("search.sigma", "0.3", "0.02")]
 
 
 def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
     wanted = {"task.options.start": "corner", "search.preset": "uber", "map.enabled": False, "search.algorithm": "es"}
     config = open_run(write_run(tmp_path / "run", wanted)).config
-    found = {one.key: (one.value, one.default) for one in facts.changed_settings(config, POINT)}
+    found = {one.key: (one.value, one.default) for one in summary.changed_settings(config, POINT)}
     assert found == {
         "task.options.start": ("corner", "default"),
         "search.preset": ("uber", "literature"),
@@ -60,20 +60,20 @@ def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
 def test_a_key_of_another_kind_of_part_has_its_own_default(tmp_path):
     wanted = {"search.shaping.kind": "top_pairs", "search.shaping.count": 2, "search.algorithm": "es"}
     config = open_run(write_run(tmp_path / "run", wanted)).config
-    found = {one.key: (one.value, one.default) for one in facts.changed_settings(config, POINT)}
+    found = {one.key: (one.value, one.default) for one in summary.changed_settings(config, POINT)}
     assert found == {"search.shaping.kind": ("top_pairs", "ranks"), "search.shaping.count": ("2", "null")}
 
 
 def test_all_settings_are_shown_if_the_defaults_are_unknown(folder):
     config = open_run(folder).config
-    found = facts.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
+    found = summary.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
     assert {"search.forgotten", "search.step.l2"} <= {one.key for one in found}
     assert {one.default for one in found} == {""}
 
 
 def test_the_verdict_says_what_was_found(folder):
     data = read_run(folder)
-    sentence = facts.verdict(data)
+    sentence = summary.verdict(data)
     generation, fitness = data.best
     assert f"found in generation {generation}, has a mean fitness of {fitness:.2f} over 30 evaluation" in sentence
     assert "came to the goal is 0.024" in sentence  # 0.5 / 21
@@ -83,15 +83,15 @@ def test_the_verdict_says_what_was_found(folder):
 def test_the_verdict_names_the_target(tmp_path):
     missed = read_run(write_run(tmp_path / "missed", {"budget.target_fitness": 0.0}))
     reached = read_run(write_run(tmp_path / "reached", {"budget.target_fitness": -90.0}))
-    assert "does not reach the target of 0.000" in facts.verdict(missed)
-    assert "which reaches the target of -90.00" in facts.verdict(reached)
+    assert "does not reach the target of 0.000" in summary.verdict(missed)
+    assert "which reaches the target of -90.00" in summary.verdict(reached)
 
 
 def test_faults_are_counted(folder):
-    found = facts.faults(read_run(folder))
+    found = summary.faults(read_run(folder))
     assert [tuple(one) for one in found] == [(5, 1, 2)]
-    assert facts.fault_sentence(found).startswith("1 worker was lost and replaced, and 2 chunks were sent again")
-    assert facts.fault_sentence([]) == "No worker was lost and no chunk had to be sent again."
+    assert summary.fault_sentence(found).startswith("1 worker was lost and replaced, and 2 chunks were sent again")
+    assert summary.fault_sentence([]) == "No worker was lost and no chunk had to be sent again."
 
 
 def test_phases_add_up(folder):
@@ -103,8 +103,8 @@ def test_phases_add_up(folder):
 
 def test_generation_0_alone_is_shown(tmp_path):
     data = read_run(write_run(tmp_path / "begun", generations=0, filled=0.01))
-    assert "Only the initial centres were evaluated" in facts.verdict(data)
-    assert "before any update" in facts.verdict(data)
+    assert "Only the initial centres were evaluated" in summary.verdict(data)
+    assert "before any update" in summary.verdict(data)
     assert series.charts(data.history, data.centres, 0.0)[0].title == "Fitness"
 
 
@@ -218,16 +218,16 @@ def test_status_says_that_elites_below_the_offset_lower_the_score(tmp_path):
 def test_the_share_of_exploring_centres_is_told_where_each_explores_or_exploits(folder):
     """Of generations 1 to 20, those from 10 to 19 exploited."""
     data = read_run(folder)
-    assert dict(facts.what_was_run(data))["centres"] == "50.0 % of 20 explored, 50.0 % exploited"
+    assert dict(summary.what_was_run(data))["centres"] == "50.0 % of 20 explored, 50.0 % exploited"
     mixed = replace(data, centres={**data.centres, "fitness_weight": 0.5 * data.centres["fitness_weight"]})
-    assert "centres" not in dict(facts.what_was_run(mixed))
+    assert "centres" not in dict(summary.what_was_run(mixed))
 
 
 def test_a_run_without_a_map_has_none(tmp_path):
     data = read_run(write_run(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}))
     assert data.map is None
     assert data.problems == ()
-    assert "map" not in facts.verdict(data)
+    assert "map" not in summary.verdict(data)
 
 
 def damaged(folder, statement, *values):
@@ -305,8 +305,8 @@ def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
     assert data.last("generation") == 21
     assert data.best == (data.best[0], 0.0)
     assert data.digest == ""
-    assert dict(facts.what_was_run(data))["state"].startswith("running on")
-    assert dict(facts.provenance(data))["digest"] == "not computed while a driver is writing"
+    assert dict(summary.what_was_run(data))["state"].startswith("running on")
+    assert dict(summary.provenance(data))["digest"] == "not computed while a driver is writing"
     assert read_run(folder).digest == open_run(folder).digest()
 
 
@@ -315,7 +315,7 @@ def test_code_is_told_in_a_line_and_a_change_of_it_by_its_files(tmp_path):
     data = read_run(write_run(tmp_path / "run"))
     before, after = {"loop/a.py": "1" * 64, "loop/b.py": "2" * 64}, {"loop/a.py": "1" * 64, "loop/b.py": "3" * 64}
     platforms = [(0, {"cpu": "x", "jax": "1.0", CODE: before}), (9, {"cpu": "x", "jax": "1.0", CODE: after})]
-    fields = dict(facts.provenance(replace(data, platforms=platforms)))
+    fields = dict(summary.provenance(replace(data, platforms=platforms)))
     assert fields["versions since generation 0"] == "jax 1.0"
     first, second = (fields[f"code since generation {at}"] for at in (0, 9))
     assert first == code_text(before)
@@ -325,7 +325,7 @@ def test_code_is_told_in_a_line_and_a_change_of_it_by_its_files(tmp_path):
 
 def test_an_interrupted_run_is_shown_as_one(tmp_path):
     data = read_run(write_run(tmp_path / "run", {"budget.generations": 1000}))
-    fields = dict(facts.what_was_run(data))
+    fields = dict(summary.what_was_run(data))
     assert fields["state"] == "stopped before its budget was spent"
     assert fields["generations"] == "20 of 1,000"
     assert data.digest

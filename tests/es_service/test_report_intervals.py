@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import erfinv
 
-from es_service.report.bootstrap import WHOLE_RANGE, _medians, coverage, median_interval
+from es_service.report.statistics import WHOLE_RANGE, _medians, coverage, median_interval
 
 
 def counted(values):

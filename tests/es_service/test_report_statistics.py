@@ -17,11 +17,11 @@ from es_service import plots
 from es_service.cli.report import bounds_of
 from es_service.errors import ConfigError
 from es_service.report import between, compare, statistics
-from es_service.report.bootstrap import median_interval
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
 from es_service.report.figures import empty_figure
 from es_service.report.measures import with_derived
+from es_service.report.statistics import median_interval
 from es_service.report.write import write_comparison
 from tests.es_service.test_report_compare import words
 from tests.run_examples import write_run

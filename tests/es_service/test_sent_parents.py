@@ -27,9 +27,8 @@ from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.policies import Policies
+from es_service.protocol.policies import IsoLine, Policies, Recipes, recipes_of
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
 from es_service.protocol.sent import Memory, Received, parcel
 from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import centre, spec

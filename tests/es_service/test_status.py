@@ -23,7 +23,7 @@ from es_service.cli.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
 from es_service.report.data import read_run
-from es_service.report.facts import what_was_run
+from es_service.report.summary import what_was_run
 from es_service.runs import run_status
 from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader

@@ -14,7 +14,7 @@ from es_service.cli.show import status_data
 from es_service.cli.status import print_status, print_summary
 from es_service.protocol.noise import Domain
 from es_service.report.data import read_run
-from es_service.report.facts import what_was_run
+from es_service.report.summary import what_was_run
 from es_service.runs import run_status, sessions
 from es_service.runs.certification import NamedPolicy, certify_run
 from es_service.runs.certified import (

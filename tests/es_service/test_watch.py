@@ -17,8 +17,8 @@ from es_service import api
 from es_service.cli.main import app as program
 from es_service.errors import StoreError
 from es_service.report.data import read_run
-from es_service.report.facts import number
 from es_service.report.page import run_sections
+from es_service.report.summary import number
 from es_service.report.write import python_call
 from es_service.runs.certification import certify_run
 from es_service.store import reader, upkeep, writer

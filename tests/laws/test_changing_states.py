@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.loop.arrays import changes, names_of, new_names, state_of, stored
+from es_service.loop.blocks import changes, names_of, new_names, state_of, stored
 from es_service.loop.state import Best, RunState
 from es_service.protocol.content import name_of, names
 from es_service.protocol.messages import Moments

@@ -14,7 +14,7 @@ from es_service.errors import ConfigError
 from es_service.protocol.content import names
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
-from es_service.protocol.recipes import IsoLine, variation
+from es_service.protocol.policies import IsoLine, variation
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state

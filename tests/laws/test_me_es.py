@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from es_service.loop.arrays import value_of
+from es_service.loop.blocks import value_of
 from es_service.loop.history import history_columns
 from es_service.loop.state import normalisation
 from es_service.protocol.content import as_bytes

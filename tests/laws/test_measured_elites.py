@@ -9,7 +9,7 @@ import pytest
 from es_service import api
 from es_service.api import load_config
 from es_service.errors import ConfigError
-from es_service.loop.arrays import joined
+from es_service.loop.blocks import joined
 from es_service.protocol.content import as_bytes
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms

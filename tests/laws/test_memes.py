@@ -12,7 +12,7 @@ import pytest
 from es_service.api import load_config
 from es_service.config.workload import parallel_sentence
 from es_service.errors import ConfigError
-from es_service.loop.arrays import EXTRA, joined
+from es_service.loop.blocks import EXTRA, joined
 from es_service.loop.history import history_columns
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys, uniforms

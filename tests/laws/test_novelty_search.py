@@ -6,7 +6,7 @@ import pytest
 from es_service.api import load_config
 from es_service.config.parts import Ranks, Returns
 from es_service.config.workload import worker_spec
-from es_service.loop.arrays import state_of
+from es_service.loop.blocks import state_of
 from es_service.loop.checks import invalidate
 from es_service.loop.state import no_observations
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, TrainingChunk

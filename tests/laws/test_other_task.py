@@ -20,7 +20,7 @@ from es_service.loop.contents import policy_work
 from es_service.protocol.episodes import gathered
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, seed_for
-from es_service.report.facts import elsewhere_text, number
+from es_service.report.summary import elsewhere_text, number
 from es_service.runs import certification, verification
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import (

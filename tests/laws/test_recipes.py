@@ -14,10 +14,11 @@ from es_service.errors import EvaluationError
 from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.messages import Policies, with_subject
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
-from es_service.protocol.recipes import (
+from es_service.protocol.policies import (
+    POLICY_SLOTS,
     IsoLine,
     Origin,
+    PolicyChunk,
     Recipes,
     name_of,
     recipes_again,

@@ -8,7 +8,7 @@ import pytest
 from es_service.errors import EvaluationError
 from es_service.loop import driver
 from es_service.loop.budget import Clock
-from es_service.loop.contents import Contents
+from es_service.loop.contents import StatePolicies
 from es_service.loop.generation import initial_state
 from es_service.loop.interfaces import Stop
 from es_service.loop.state import no_observations
@@ -93,7 +93,7 @@ def test_a_list_of_results_drives_a_generation():
         return results_of[-1]
 
     def bits(evaluate):
-        requests = driver.generation(search, Contents({}.get), Clock(0.0), initial_state(search))
+        requests = driver.generation(search, StatePolicies({}.get), Clock(0.0), initial_state(search))
         parts = completed(requests, evaluate).parts
         return {name: {key: array.tobytes() for key, array in (part or {}).items()} for name, part in parts.items()}
 

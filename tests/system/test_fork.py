@@ -21,7 +21,7 @@ from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.options import choice
 from es_service.report.data import read_run
-from es_service.report.facts import verdict
+from es_service.report.summary import verdict
 from es_service.runs import checked_config, engine, evaluation, lineage, sessions
 from es_service.runs.engine import dispatch_limits
 from es_service.runs.run_status import more, read_status

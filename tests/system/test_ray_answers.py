@@ -17,8 +17,8 @@ from es_service.dispatch.ray_cluster import connect, disconnect
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import TrainingChunk, with_subject
+from es_service.protocol.policies import Recipes
 from es_service.protocol.process_environment import worker_environment
-from es_service.protocol.recipes import Recipes
 from es_service.protocol.sent import Received
 from es_service.store.digest import digest_parts
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from es_service.protocol.episodes import OF_STEPS
 from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_integers, normals, uniforms
-from es_service.protocol.outputs import OF_STEPS
-from es_service.protocol.recipes import explicit
+from es_service.protocol.policies import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.references import point_maze
 from workers.compiling import Compilable

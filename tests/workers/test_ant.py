@@ -26,7 +26,7 @@ from tests.workers.steps import (
     substeps_of,
     whole,
 )
-from workers import rollout as xla
+from workers import xla
 from workers.environments import SHIPPED, make_environment
 from workers.environments.ant import AntState, contact_forces, load_system, observe
 from workers.environments.ant_tasks import STEP_S

@@ -19,6 +19,7 @@ from es_service.config.tasks import TASKS, task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.episodes import AT_THE_END, OF_STEPS
 from es_service.protocol.messages import NO_CHOICES, EvaluationChunk, HostChoices, PolicySpec, Report, TrainingChunk
 from es_service.protocol.noise import (
     NORMAL_STD,
@@ -29,7 +30,6 @@ from es_service.protocol.noise import (
     uniforms,
 )
 from es_service.protocol.options import defaults_of
-from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.engine import dispatch_limits
 from es_service.runs.replay import record

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-import workers.rollout
+import workers.xla
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, PolicySpec, TrainingChunk
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from es_service.protocol.policy_spec import LayerNoise, layers_of_noise, noise_integers, numbers
@@ -108,7 +108,7 @@ def test_gradients_are_sums_of_the_members_noise(widths, rank, bias):
     spec = helpers.spec(policy=policy, noise_rank=rank)
     found = [
         gradient_summer(spec)(weights_P, keys(pairs)),
-        workers.rollout.make_low_rank_gradient_sum(policy, rank)(weights_P, keys(pairs)),
+        workers.xla.make_low_rank_gradient_sum(policy, rank)(weights_P, keys(pairs)),
         make_low_rank_gradient_sum(policy, rank)(weights_P, keys(pairs)),
     ]
     for one in found:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from es_service.protocol.episodes import TRANSITIONS
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk, WorkerSpec
 from es_service.protocol.noise import evaluation_reset_keys
-from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.evaluator import Transitions, transitions_of
 from tests.helpers import DirectEvaluator, centre, chunk_runner, random_parameters
 from tests.workers.simd.rollouts import task_spec

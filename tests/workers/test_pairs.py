@@ -14,8 +14,8 @@ from tests import helpers
 from workers.environments import make_environment
 from workers.policies.pairs import act_in_pairs
 from workers.policies.policy import act, initial_memory, initial_parameters, split_layers
-from workers.rollout import make_training_rollout
 from workers.worker import episode_keys
+from workers.xla import make_training_rollout
 
 PAIRS, UNIT = 3, np.float32(0.05 / NORMAL_STD)
 

@@ -23,8 +23,8 @@ from tests.references import noise as noise_reference
 from tests.references import point_maze as maze_reference
 from workers import environments
 from workers.environments import Environment, make_environment
-from workers.rollout import make_training_rollout
 from workers.worker import episode_keys
+from workers.xla import make_training_rollout
 
 SHAPE = PolicySpec((2, 8, 8, 2))
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from es_service.protocol.episodes import METRIC_FORM, wrong_metric_names
 from es_service.protocol.messages import UNBOUNDED, Bounds, DescriptorChoice, TaskKind, TaskSpec
 from es_service.protocol.options import Option, OptionValue, declared_options
-from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from es_service.protocol.user_code import import_user_module, in_no_file, users_error, why_not_imported
 from workers.environments import TaskError
 from workers.environments.host_task import HostEnvironment, HostEpisode, HostTask

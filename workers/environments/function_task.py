@@ -35,9 +35,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.episodes import METRIC_FORM, wrong_metric_names
 from es_service.protocol.messages import Bounds, FloatArray, TaskSpec
 from es_service.protocol.options import FREE, OptionValue, ParameterSpec, declared_options
-from es_service.protocol.outputs import METRIC_FORM, wrong_metric_names
 from workers.environments import TaskError
 from workers.environments.declared import (
     are_finite,

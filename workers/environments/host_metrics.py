@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from es_service.protocol.episodes import METRIC_FORM, TAKEN, wrong_metric_names
 from es_service.protocol.messages import HostChoices
-from es_service.protocol.outputs import METRIC_FORM, TAKEN, wrong_metric_names
 from workers.environments import TaskError
 from workers.environments.host_task import HostEpisode, HostTask
 

@@ -2,7 +2,7 @@
 
 Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
 
-OUTPUTS are computed only if a run names them; `es_service/protocol/outputs.py` has their names.
+OUTPUTS are computed only if a run names them; `es_service/protocol/episodes.py` has their names.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.episodes import INFEASIBLE
+from es_service.protocol.episodes import AT_THE_END, INFEASIBLE, METRICS, OF_STEPS
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
 from es_service.protocol.noise import seed_of
-from es_service.protocol.outputs import AT_THE_END, METRICS, OF_STEPS
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
 from workers.policies.policy import LanePolicies
@@ -72,7 +71,7 @@ OUTPUTS: Mapping[str, HostOutput] = {
     ),
 }
 """All outputs by name."""
-assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/outputs.py has its functions here"
+assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/episodes.py has its functions here"
 
 
 class Outputs:

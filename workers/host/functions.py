@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.child import Child, NoAnswerError
-from es_service.protocol.episodes import INFEASIBLE
+from es_service.protocol.episodes import INFEASIBLE, METRICS
 from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.noise import seed_of
 from es_service.protocol.options import OptionValue
-from es_service.protocol.outputs import METRICS
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.user_code import RaisedError, raised
 from workers import progress
@@ -94,13 +93,13 @@ LONGEST = 1000
 """Longest reason of a failure there, in characters."""
 POINTS = 2
 """Points of a trace, of an episode with one step."""
-Call = Callable[[FloatArray, int], tuple[float, Any, Any]]
+TaskCall = Callable[[FloatArray, int], tuple[float, Any, Any]]
 """Function (parameters [D], seed) -> (fitness, descriptor [B], metrics [M])."""
 
 
 def run_calls(
     task: FunctionTask,
-    called: Call,
+    called: TaskCall,
     spec: WorkerSpec,
     parameters_L_D: FloatArray,
     mean: FloatArray,
@@ -160,7 +159,7 @@ def run_calls(
 
 def _called(
     task: FunctionTask,
-    called: Call,
+    called: TaskCall,
     parameters_D: FloatArray,
     seed: int,
     *,

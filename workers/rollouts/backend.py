@@ -17,7 +17,7 @@ import numpy as np
 
 from es_service.protocol.messages import EpisodesResult, Moments, TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
-from es_service.protocol.recipes import FloatArray, Recipes
+from es_service.protocol.policies import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from es_service.protocol.rollouts import Rollout
 from workers.compiling import Compilable

@@ -10,8 +10,7 @@ import numpy as np
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, seed_of, stream_keys
 from es_service.protocol.options import OptionValue
-from es_service.protocol.policies import POLICY_SLOTS
-from es_service.protocol.recipes import explicit
+from es_service.protocol.policies import POLICY_SLOTS, explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import progress
 from workers.compiling import Compilable

@@ -84,7 +84,7 @@ def record(
     """Record the requested episodes with a rollout's own loop, so that they have the bits of the run's own.
 
     Args:
-        make_watched_rollout: as `workers.rollout.make_watched_rollout`.
+        make_watched_rollout: as `workers.xla.make_watched_rollout`.
     """
     environment = environments.make_environment(spec.environment, spec.environment_options)
     watched = {own: make_watched_rollout(environment, spec, per_lane_weights=own) for own in (False, True)}

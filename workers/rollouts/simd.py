@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from es_service.protocol.episodes import OF_STEPS
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
-from es_service.protocol.outputs import OF_STEPS
+from es_service.protocol.policies import FloatArray, Recipes
 from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.process_environment import on_gpu
-from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
 from workers.rollouts.backend import ChunkFunctions, Examination, RolloutBackend
@@ -64,7 +64,7 @@ class Simd(RolloutBackend):
         elsewhere = None
         # The code for GPUs keeps no outputs of steps, and has no noise of low rank.
         if gpu and not set(spec.outputs) & set(OF_STEPS) and not spec.noise_rank:
-            from workers.simd.gpu.rollout import episodes_on_gpu
+            from workers.simd.gpu.training import episodes_on_gpu
 
             elsewhere = episodes_on_gpu(environment, spec)
         functions = ChunkFunctions(
@@ -78,12 +78,12 @@ class Simd(RolloutBackend):
         return judged(functions, spec)
 
     def device(self) -> str:
-        from workers.simd.gpu.driver import the_gpu
+        from workers.simd.gpu.cuda import the_gpu
 
         return the_gpu().name
 
     def made(self, recipes: Recipes) -> FloatArray:
-        from workers.simd.episodes.noise import make_variation
+        from workers.simd.episodes.noise_kernels import make_variation
 
         return make_variation()(recipes)
 

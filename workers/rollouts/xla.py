@@ -14,7 +14,7 @@ from workers.rollouts.backend import ChunkFunctions, RolloutBackend
 
 
 class Xla(RolloutBackend):
-    """Batched episodes compiled by XLA (`workers/rollout.py`)."""
+    """Batched episodes compiled by XLA (`workers/xla.py`)."""
 
     name = "xla"
     runs_on_gpus = True
@@ -26,7 +26,7 @@ class Xla(RolloutBackend):
         return jax.devices()[0].device_kind
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        from workers import rollout
+        from workers import xla
         from workers.rollouts.jax_tasks import judged
         from workers.scatters import without_scatters
 
@@ -35,19 +35,19 @@ class Xla(RolloutBackend):
             reset, step = without_scatters(environment.reset), without_scatters(environment.step)
             environment = replace(environment, reset=reset, step=step)
         functions = ChunkFunctions(
-            rollout.make_training_rollout(environment, spec, in_pairs=gpu),
-            rollout.make_evaluation_rollout(environment, spec),
-            rollout.make_policy_rollout(environment, spec),
-            rollout.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
+            xla.make_training_rollout(environment, spec, in_pairs=gpu),
+            xla.make_evaluation_rollout(environment, spec),
+            xla.make_policy_rollout(environment, spec),
+            xla.make_low_rank_gradient_sum(spec.policy, spec.noise_rank)
             if spec.noise_rank
-            else rollout.make_gradient_sum(spec.policy.parameters),
+            else xla.make_gradient_sum(spec.policy.parameters),
         )
         return judged(functions, spec)
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""
-        from workers.rollout import make_watched_rollout
         from workers.rollouts.jax_tasks import record
+        from workers.xla import make_watched_rollout
 
         return record(make_watched_rollout, spec, requests)
 

@@ -16,7 +16,7 @@ from es_service.config.parts import Objective
 from es_service.protocol.content import Policy
 from es_service.protocol.episodes import part_of
 from es_service.protocol.messages import EpisodesResult, FloatArray
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import Recipes
 from es_service.search.arrays import freeze, read_only
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, sound_archive

@@ -30,7 +30,7 @@ from es_service.config.parts import CountAtOnce, Elites, MeasuredNewcomers, NotN
 from es_service.config.search import SearchConfig, same
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
-from es_service.protocol.recipes import IsoLine, recipes_of
+from es_service.protocol.policies import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
 from es_service.search.algorithms.common import add_to_archive, add_to_archive_and_map
 from es_service.search.algorithms.measured import (

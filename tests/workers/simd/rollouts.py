@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-import workers.rollout
+import workers.xla
 from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from tests.helpers import spec
@@ -74,5 +74,5 @@ def by_xla(worker_spec: WorkerSpec, *given: Any) -> Episodes:
     key = repr(worker_spec)
     if key not in _XLA:
         environment = make_environment(worker_spec.environment, {})
-        _XLA[key] = workers.rollout.make_training_rollout(environment, worker_spec)
+        _XLA[key] = workers.xla.make_training_rollout(environment, worker_spec)
     return jax.tree.map(np.asarray, _XLA[key](*given))

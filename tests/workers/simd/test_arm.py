@@ -27,7 +27,7 @@ from tests.workers.simd.rollouts import arguments, every_target, targets, task_s
 from workers.environments import make_environment
 from workers.simd.backend.native import require_same
 from workers.simd.backend.target import Target
-from workers.simd.episodes import compiled, kernel, noise, rollout
+from workers.simd.episodes import compiled, kernel, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
@@ -165,7 +165,7 @@ def digest_on(hosts: Sequence[Target], folder: Path) -> dict[str, str]:
             found: list[Any] = [None] * len(work)
             for number, (host, worker) in enumerate(zip(hosts, workers, strict=True)):
                 with pytest.MonkeyPatch.context() as patch:  # kernels are compiled when they are first needed
-                    for module in (compiled, kernel, rollout, noise):
+                    for module in (compiled, kernel, rollout, noise_kernels):
                         patch.setattr(module, "host_target", lambda host=host: host)
                     found[number :: len(hosts)] = worker(work[number :: len(hosts)])
             return found

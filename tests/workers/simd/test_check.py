@@ -19,7 +19,7 @@ from tests.workers.simd.rollouts import every_target, targets
 from workers.environments import make_environment
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.backend.native import WrongCodeError, require_same
-from workers.simd.episodes import noise
+from workers.simd.episodes import noise_kernels
 from workers.simd.episodes.check import check_episodes, check_resets
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
@@ -136,9 +136,9 @@ def test_a_wrong_gradient_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_noise_of_the_wrong_pair_is_found(worker, monkeypatch: pytest.MonkeyPatch) -> None:
     def of_the_first(builder: FunctionBuilder, keys: str) -> list[str]:
-        return noise.load_key(builder, keys, "0")
+        return noise_kernels.load_key(builder, keys, "0")
 
-    monkeypatch.setattr(noise, "keys_of_members", of_the_first)
+    monkeypatch.setattr(noise_kernels, "keys_of_members", of_the_first)
     with pytest.raises(WrongCodeError):
         worker(TrainingChunk(1, 0))
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import workers.rollout
+import workers.xla
 from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
 from tests.helpers import random_parameters, spec
@@ -26,7 +26,7 @@ from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.hidden import plan
 from workers.simd.episodes.low_rank import make_low_rank_gradient_sum
-from workers.simd.episodes.noise import UNROLLED, fill_function
+from workers.simd.episodes.noise_kernels import UNROLLED, fill_function
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
     assert len(found[0].returns) == 2 * pairs
     assert len(np.unique(found[0].returns)) > pairs
     if training and pairs == worker_spec.chunk_pairs:
-        theirs = workers.rollout.make_training_rollout(environment, worker_spec)
+        theirs = workers.xla.make_training_rollout(environment, worker_spec)
         theirs = theirs(centre_D, unit, mean_O, std_O, keys, resets, actions)
         np.testing.assert_allclose(found[0].returns, np.asarray(theirs.returns).ravel(), rtol=1e-3)
     for other in found[1:]:
@@ -194,7 +194,7 @@ def test_a_reset_that_cannot_be_compiled_is_jaxs():
     worker_spec = spec(policy=PolicySpec((2, 8, 2)))
     given = arguments(worker_spec)
     ours = rollout.make_training_rollout(transforming, worker_spec)(*given)
-    theirs = workers.rollout.make_training_rollout(transforming, worker_spec)(*given)
+    theirs = workers.xla.make_training_rollout(transforming, worker_spec)(*given)
     np.testing.assert_allclose(ours.returns, np.asarray(theirs.returns), rtol=1e-4)
 
 

@@ -16,7 +16,7 @@ from workers.environments import make_environment
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.native import WrongCodeError
 from workers.simd.episodes.rollout import make_training_rollout
-from workers.simd.gpu.rollout import episodes_on_gpu
+from workers.simd.gpu.training import episodes_on_gpu
 from workers.worker import episode_keys
 
 POLICY = PolicySpec(widths=(2, 7, 9, 2))

@@ -20,7 +20,7 @@ from workers.simd.backend import emit, native, target
 from workers.simd.backend.native import aligned, pack
 from workers.simd.backend.target import Target, host_target
 from workers.simd.episodes.kernel import Kernel, compile_kernel
-from workers.simd.episodes.noise import gradient_module
+from workers.simd.episodes.noise_kernels import gradient_module
 from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import evaluate

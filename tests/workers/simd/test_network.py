@@ -19,7 +19,7 @@ from workers.simd.backend.target import Target
 from workers.simd.episodes import hidden
 from workers.simd.episodes.hidden import Network, keep_function, plan
 from workers.simd.episodes.network import policy_function
-from workers.simd.episodes.noise import fill_function
+from workers.simd.episodes.noise_kernels import fill_function
 
 SIGMA = 0.1
 UNTOUCHED = 7.0

@@ -16,7 +16,7 @@ from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.backend import emit
-from workers.simd.episodes import check, noise, rollout
+from workers.simd.episodes import check, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.indexing import MOST_CHOICES
 from workers.simd.frontend.tracer import PRIMITIVES
@@ -27,7 +27,7 @@ def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPa
     """Kernels are kept on disk; the noise's definition stands outside of the compiler's own files."""
     weights_P, keys_P = np.ones(1, np.float32), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(1))
     before = rollout.make_gradient_sum(50)(weights_P, keys_P)
-    for module in (noise, check):
+    for module in (noise_kernels, check):
         monkeypatch.setattr(module, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
     np.testing.assert_allclose(rollout.make_gradient_sum(50)(weights_P, keys_P), 3 * before, rtol=1e-6)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
+from es_service.protocol.policies import IsoLine, Recipes, recipes_of
 from tests.workers.simd.rollouts import every_target
 from workers.rollouts import BACKENDS
 from workers.simd.backend.native import WrongCodeError
 from workers.simd.backend.target import Target
-from workers.simd.episodes import noise
+from workers.simd.episodes import noise_kernels
 
 RULES = (IsoLine(0.005, 0.05), IsoLine(0.0, 0.0), IsoLine(0.3, 0.0), IsoLine(3.7, 11.3))
 
@@ -33,7 +33,7 @@ def assert_equal(found: np.ndarray, wanted: np.ndarray) -> None:
 @pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("rule", RULES, ids=str)
 def test_policies_have_the_bits_of_their_definition_at_every_width_and_size(rule, target: Target):
-    made = noise.make_variation(target)
+    made = noise_kernels.make_variation(target)
     for size in (1, 7, 8, 9, 15, 16, 17, 31, 32, 114, 4482):
         asked = recipes(size, rule=rule)
         assert_equal(made(asked), asked.made())
@@ -49,7 +49,7 @@ def test_values_that_are_denormal_infinite_or_no_numbers_are_those_of_numpy(targ
         asked = recipes(36, rule=rule, parents=parents)
         with np.errstate(all="ignore"):
             wanted = asked.made()
-        found = noise.make_variation(target)(asked)
+        found = noise_kernels.make_variation(target)(asked)
         assert (np.isnan(found) == np.isnan(wanted)).all()
         assert_equal(np.nan_to_num(found), np.nan_to_num(wanted))
         assert (np.abs(wanted[wanted != 0.0]) < 1e-38).any() == has_denormal
@@ -64,9 +64,9 @@ def test_every_rollout_makes_the_same_policies():
 def test_parents_of_different_sizes_are_refused_before_memory_is_read():
     asked = recipes(100)
     with pytest.raises(ValueError, match="parents of one size"):
-        noise.make_variation()(replace(asked, parents=(asked.parents[0][:50], *asked.parents[1:])))
+        noise_kernels.make_variation()(replace(asked, parents=(asked.parents[0][:50], *asked.parents[1:])))
 
 
 def test_wrong_code_is_noticed_before_it_is_used():
     with pytest.raises(WrongCodeError, match="a policy made of its parents differ"):
-        noise.check_variation(lambda asked: asked.made() + np.float32(1e-6))
+        noise_kernels.check_variation(lambda asked: asked.made() + np.float32(1e-6))

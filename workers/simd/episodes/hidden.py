@@ -23,7 +23,7 @@ from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.backend.native import ALIGNMENT, aligned
 from workers.simd.backend.target import Target
-from workers.simd.episodes.noise import noise_of_weights
+from workers.simd.episodes.noise_kernels import noise_of_weights
 from workers.simd.frontend.primitives.elementwise import extreme_of
 from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph

@@ -32,7 +32,7 @@ from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, aligned, load_compiled, require, require_same
 from workers.simd.backend.target import Target, host_target
 from workers.simd.episodes.hidden import Layer
-from workers.simd.episodes.noise import (
+from workers.simd.episodes.noise_kernels import (
     UNROLLED,
     by_sign,
     definition,
@@ -197,7 +197,7 @@ TABLE = 6
 
 
 def make_low_rank_gradient_sum(policy: PolicySpec, rank: int, target: Target | None = None) -> Compilable:
-    """Sum of weighted noise, with the interface of `workers.rollout.make_low_rank_gradient_sum`; compiled here."""
+    """Sum of weighted noise, with the interface of `workers.xla.make_low_rank_gradient_sum`; compiled here."""
     target = target or host_target()
     group = UNROLLED * target.width
     drawn = -(-numbers(policy, rank) // target.width)

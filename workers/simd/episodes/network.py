@@ -18,7 +18,7 @@ from typing import Literal
 from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.episodes.hidden import Network, View, activated, first_sums, per_lane, perturbed, shared, units
 from workers.simd.episodes.low_rank import BlockNoise, begins_of_hidden, begins_of_last, thin_sums
-from workers.simd.episodes.noise import by_sign, noise_of_weights
+from workers.simd.episodes.noise_kernels import by_sign, noise_of_weights
 
 Weights = Literal["shared", "perturbed", "per_lane"]
 """Where the weights of a member are from; see `hidden.py`."""

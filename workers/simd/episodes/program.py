@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from es_service.protocol.episodes import OF_STEPS
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
-from es_service.protocol.outputs import OF_STEPS
 from workers.environments import Environment
 from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
@@ -28,7 +28,7 @@ from workers.simd.backend.target import Target
 from workers.simd.episodes.hidden import Network, keep_function, plan
 from workers.simd.episodes.low_rank import BlockNoise, plan_noise
 from workers.simd.episodes.network import Weights, policy_function, singles_function
-from workers.simd.episodes.noise import definition, fill_function
+from workers.simd.episodes.noise_kernels import definition, fill_function
 from workers.simd.frontend.trace import jaxpr_digest, trace_jaxpr
 from workers.simd.graph.graph import Graph
 

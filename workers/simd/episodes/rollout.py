@@ -1,4 +1,4 @@
-"""The functions of `workers.rollout` compiled with simd, and the check whether simd supports a task."""
+"""The functions of `workers.xla` compiled with simd, and the check whether simd supports a task."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from es_service.protocol.options import OptionValue, option_values
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import Recipes
 from workers.compiling import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
@@ -26,7 +26,7 @@ from workers.simd.backend.native import Native, aligned, load_compiled, require
 from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
-from workers.simd.episodes.noise import UNROLLED, definition, gradient_module, make_variation
+from workers.simd.episodes.noise_kernels import UNROLLED, definition, gradient_module, make_variation
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.graph import UnsupportedError, fault
@@ -82,7 +82,7 @@ def training_program(task: TaskSpec, options: Mapping[str, OptionValue]) -> Epis
 def make_training_rollout(
     environment: Environment, spec: WorkerSpec, elsewhere: Compilable | None = None
 ) -> Compilable:
-    """Rollout of one training chunk, with the interface of `workers.rollout.make_training_rollout`.
+    """Rollout of one training chunk, with the interface of `workers.xla.make_training_rollout`.
 
     Args:
         elsewhere: function (kernel, centre_D, arguments of `EpisodeKernel.run` after the weights) -> Episodes with the
@@ -123,7 +123,7 @@ def make_training_rollout(
 
 
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
-    """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
+    """Rollout of one evaluation chunk, with the interface of `workers.xla.make_evaluation_rollout`."""
     with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
     kernels = _Kernels(environment, spec, training=False)
 
@@ -142,7 +142,7 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
 
 
 def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
-    """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
+    """Rollout of explicit policies, with the interface of `workers.xla.make_policy_rollout`, for any number of
     lanes."""
     with_faults = partial(_with_faults, allow_infeasible=spec.allow_infeasible)
     kernels = _Kernels(environment, spec, training=False, per_lane_weights=True)
@@ -178,7 +178,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
 
 
 def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, per_lane_weights: bool) -> Callable[..., Carry]:
-    """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout`.
+    """Rollout of one episode, with the interface of `workers.xla.make_watched_rollout`.
 
     An episode's bits depend neither on its slot nor on whether its weights are those of a centre or of a policy.
     """
@@ -295,7 +295,7 @@ class _Kernels:
 
 
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Compilable:
-    """Sum of weighted noise, with the interface of `workers.rollout.make_gradient_sum`; it is compiled here."""
+    """Sum of weighted noise, with the interface of `workers.xla.make_gradient_sum`; it is compiled here."""
     target = target or host_target()
     signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
     group = UNROLLED * target.width

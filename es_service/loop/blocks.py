@@ -22,7 +22,7 @@ from es_service.protocol.content import NAME, NO_NAME, Arrays, as_bytes, names_i
 from es_service.search.algorithms.base import SearchState, frozen
 from es_service.search.arrays import same, same_rows
 
-Nodes = Mapping[str, Arrays]
+Tree = Mapping[str, Arrays]
 """Path of a node -> its arrays; or name of a stored block -> its arrays."""
 Changes = Mapping[str, Arrays | None]
 """Blocks that a generation has changed, by name; None for those that it has removed."""
@@ -84,7 +84,7 @@ def names_of(blocks: Changes) -> frozenset[bytes]:
     return frozenset[bytes]().union(*(names_in(arrays) for arrays in blocks.values() if arrays is not None))
 
 
-def joined(blocks: Nodes) -> dict[str, Arrays]:
+def joined(blocks: Tree) -> dict[str, Arrays]:
     """The nodes whose blocks are given."""
     nodes: dict[str, Arrays] = {}
     tables: dict[str, dict[int, Arrays]] = {}
@@ -100,7 +100,7 @@ def joined(blocks: Nodes) -> dict[str, Arrays]:
     return nodes
 
 
-def state_of(blocks: Nodes, generation: int, wall_clock_s: float) -> RunState:
+def state_of(blocks: Tree, generation: int, wall_clock_s: float) -> RunState:
     """The state that consists of these blocks, or nodes; inverse of `stored`.
 
     Raises:
@@ -122,7 +122,7 @@ def state_of(blocks: Nodes, generation: int, wall_clock_s: float) -> RunState:
     )
 
 
-def value_of(kind: Any, nodes: Nodes, path: str) -> Any:
+def value_of(kind: Any, nodes: Tree, path: str) -> Any:
     """The value of a type that is at a path among nodes; None if it may be None and is not there.
 
     Raises:
@@ -137,7 +137,7 @@ def value_of(kind: Any, nodes: Nodes, path: str) -> Any:
     raise ValueError(f"the state has no {path}")
 
 
-def _value(kind: Any, nodes: Nodes, path: str) -> Any:
+def _value(kind: Any, nodes: Tree, path: str) -> Any:
     """As `value_of` for a type without alternatives; None if it is not there."""
     node, _, name = path.rpartition("/")
     array, origin = nodes.get(node, {}).get(name), get_origin(kind)
@@ -160,14 +160,14 @@ def _value(kind: Any, nodes: Nodes, path: str) -> Any:
     return _tuples(array.tolist()) if origin is tuple else array
 
 
-def _or_none(kind: Any, nodes: Nodes, path: str) -> Any:
+def _or_none(kind: Any, nodes: Tree, path: str) -> Any:
     try:
         return value_of(kind, nodes, path)
     except ValueError:
         return None
 
 
-def _mapping(nodes: Nodes, path: str) -> dict[str, Any]:
+def _mapping(nodes: Tree, path: str) -> dict[str, Any]:
     """The mapping at a path, with those in it."""
     below = {other.removeprefix(f"{path}/").partition("/")[0] for other in nodes if other.startswith(f"{path}/")}
     return {**nodes.get(path, {}), **{name: _mapping(nodes, f"{path}/{name}") for name in sorted(below)}}

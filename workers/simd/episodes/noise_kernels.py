@@ -12,7 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, normal_integers, stream_keys
-from es_service.protocol.recipes import FloatArray, IsoLine, Recipes, recipes_of
+from es_service.protocol.policies import FloatArray, IsoLine, Recipes, recipes_of
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Names, module
 from workers.simd.backend.native import Native, load_compiled, require, require_same
@@ -163,7 +163,7 @@ def float_constant(value: np.float32) -> str:
     return f"0x{np.float64(value).view(np.uint64):016X}"
 
 
-# Code that makes policies of recipes: the iso+line variation with the bits of `es_service.protocol.recipes`.
+# Code that makes policies of recipes: the iso+line variation with the bits of `es_service.protocol.policies`.
 #
 # Its operations are those of the definition, one by one, and it does not treat denormal numbers as zeros, which NumPy
 # does not either.

@@ -17,7 +17,7 @@ from workers.environments import Environment
 from workers.rollouts.backend import Episodes
 from workers.simd.backend.native import require_same
 from workers.simd.episodes.compiled import EpisodeKernel
-from workers.simd.gpu.driver import Gpu, GpuArray, Module, the_gpu
+from workers.simd.gpu.cuda import Gpu, GpuArray, Module, the_gpu
 from workers.simd.gpu.program import TILE, GpuLayer, episode_functions, layers_of
 
 STEPS_BETWEEN_LOOKS = 25

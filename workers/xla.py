@@ -16,12 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from es_service.protocol.episodes import OF_STEPS
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
-from es_service.protocol.outputs import OF_STEPS
-from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.policies import POLICY_SLOTS, explicit
 from es_service.protocol.policy_spec import PolicySpec, layers_of_noise, numbers, product_unit
-from es_service.protocol.recipes import explicit
 from workers.compiling import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
