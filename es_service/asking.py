@@ -85,7 +85,6 @@ class Asked:
 
     @property
     def generation(self) -> int:
-        """Generation that they belong to."""
         return self.token.generation
 
     def __len__(self) -> int:

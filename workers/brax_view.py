@@ -77,12 +77,10 @@ class TaskBraxEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Numbers of an observation."""
         return self.task.observation_size
 
     @property
     def action_size(self) -> int:
-        """Numbers of an action."""
         return self.task.action_size
 
     @property
@@ -150,6 +148,5 @@ def _carry(state: State) -> Any:
 
 
 def _split(keys_N: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two keys for each."""
     both = jax.vmap(jax.random.split)(keys_N)
     return both[:, 0], both[:, 1]

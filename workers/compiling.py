@@ -28,7 +28,6 @@ class Compilable:
     """Function of the same arguments that compiles what `run` needs for them, and computes nothing else."""
 
     def __call__(self, *arguments: Any) -> Any:
-        """The result of `run`."""
         return self.run(*arguments)
 
     def seconds_to_compile(self, *arguments: Any) -> float:

@@ -32,8 +32,6 @@ AnyWork = TypeVar("AnyWork")
 
 
 class _Child(NamedTuple):
-    """What a child process has."""
-
     worker: Compilable
     task_code: tuple[str, ...]
     """The name of the task."""

@@ -26,8 +26,6 @@ from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
 
 
 class EpisodeStep(NamedTuple):
-    """One step of an episode."""
-
     before: Any
     """State of the environment before the step."""
     action_A: Any
@@ -60,7 +58,6 @@ def named_outputs(names: Sequence[str]) -> dict[str, EpisodeOutput]:
 
 
 def _of_state(value: Callable[[Environment, Any], Any]) -> EpisodeOutput:
-    """An output of the state alone."""
     return EpisodeOutput(
         lambda environment, state, _: value(environment, state),
         lambda environment, step, _: value(environment, step.state),

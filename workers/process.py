@@ -189,12 +189,10 @@ class _Said:
         threading.Thread(target=self._report, daemon=True, name="reports progress").start()
 
     def say(self, *message: Any) -> None:
-        """Send a message."""
         with self._turn:
             self._parent.sendall(framed(message))
 
     def report(self) -> None:
-        """Send what there is to report."""
         if (report := self._reports.report()) is not None:
             self.say("report", report)
 

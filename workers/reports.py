@@ -39,7 +39,6 @@ class Tail:
 
     @property
     def file(self) -> tuple[int, int]:
-        """What tells the file from others."""
         status = os.fstat(self._file)
         return status.st_dev, status.st_ino
 
@@ -95,7 +94,6 @@ class Reports:
         self._turn, self.episodes, self._looked_s, self._is_told = threading.Lock(), episodes, time.monotonic(), False
 
     def note(self, results: Iterable[ChunkResult]) -> None:
-        """Count the episodes of results."""
         of_member = self._of_member  # a training chunk, which alone has moments, counts members
         episodes = sum(
             result.steps.size * (of_member if result.moments is not None else 1)

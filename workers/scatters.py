@@ -33,7 +33,6 @@ def without_scatters(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
-    """Outputs of a jaxpr."""
     jaxpr = closed.jaxpr
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
 

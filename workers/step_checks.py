@@ -154,7 +154,6 @@ def _rate(call: Callable[[], object], seconds: float) -> float:
 
 
 def _from_c(environment: Environment, before: Any, after: Any, actions_L_A: np.ndarray) -> dict[str, Any]:
-    """See `StepCost.from_c`."""
     if (of := environment.control_step) is None:
         return {}
     from workers.environments.c_mujoco import c_step, one_ulp, quantiles, relative_error

@@ -169,7 +169,6 @@ def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], K
 
 
 def _wanted(chunk: EvaluationChunk) -> Any:
-    """Which of a chunk's episodes are wanted."""
     slot_E = np.arange(EVALUATION_EPISODES_PER_CHUNK)
     return (slot_E >= chunk.first) & (slot_E < chunk.first + chunk.episodes)
 
@@ -277,7 +276,6 @@ def _around_one(work: Sequence[tuple[Centre, AnyChunk]]) -> tuple[Centre, list[A
 
 
 def _ids(chunks: Sequence[Chunk], size: int) -> Any:
-    """Ids of the pairs or the episodes of chunks, `size` in each."""
     return np.concatenate([chunk.chunk_id * size + np.arange(size) for chunk in chunks])
 
 

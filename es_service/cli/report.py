@@ -116,8 +116,6 @@ def report(
 
 
 class _How(NamedTuple):
-    """Options of a comparison."""
-
     group_by: Sequence[str]
     threshold: float | None
     figures: Path | None

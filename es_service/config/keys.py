@@ -65,9 +65,7 @@ class HasSettings(Protocol):
     """A method, as far as a config is concerned."""
 
     @property
-    def settings(self) -> type[SearchConfig]:
-        """Its class of settings."""
-        ...
+    def settings(self) -> type[SearchConfig]: ...
 
 
 Methods = Mapping[str, HasSettings]
@@ -149,7 +147,6 @@ def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: A
 
 
 def not_a_mapping(group: str, value: object) -> Problem:
-    """The problem of a section that has a value in place of keys."""
     hint = f"indent its keys below `{_leaf(group)}:`, or delete the line to use the defaults"
     return problem_of(group, value, f"{show(value)} is not a mapping of keys; {hint}")
 

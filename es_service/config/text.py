@@ -38,7 +38,6 @@ class _Constructor(SafeConstructor):
             raise ConstructorError(None, None, f"this is no {tag}", node.start_mark) from None
 
     def construct_text(self, node: ScalarNode) -> str:
-        """The text of a scalar."""
         return str(self.construct_scalar(node))
 
 
@@ -50,7 +49,6 @@ class _Representer(SafeRepresenter):
         return True
 
     def represent_list(self, data: Any) -> Any:
-        """A list on one line."""
         return self.represent_sequence(f"{_TAG}seq", data, flow_style=True)
 
     def represent_number(self, data: float) -> Any:

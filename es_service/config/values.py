@@ -121,8 +121,6 @@ def allowed_words(annotation: Any, metadata: Iterable[object] = ()) -> str:
 
 
 class DescribedKey(NamedTuple):
-    """A key of configs, for people."""
-
     key: str
     default: str
     """In YAML, both presets with a slash between, or "required"; then those of methods that have another one."""
@@ -161,7 +159,6 @@ def methods_words(methods: tuple[str, ...], algorithms: Methods) -> str:
 
 
 def _default_text(key: str, settings: type[SearchConfig]) -> str:
-    """The default of a key with a method, as text."""
     field = (FIELDS | search_fields(settings))[key]
     if row := {row.key: row for row in preset_rows(settings)}.get(key):
         return " / ".join(dict.fromkeys((show(row.literature), show(row.uber))))

@@ -267,7 +267,6 @@ def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:
 
 
 def without(slots: tuple[Slot, ...], index: int) -> tuple[Slot, ...]:
-    """Slots without the one at an index."""
     return slots[:index] + slots[index + 1 :]
 
 

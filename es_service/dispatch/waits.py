@@ -39,7 +39,6 @@ class Waits:
         self._begun_s = math.inf
 
     def begin(self, kinds: Iterable[str], now: float) -> None:
-        """A phase begins, with chunks of these kinds."""
         self._kinds, self._begun_s = tuple(dict.fromkeys(kinds)), now
 
     def tell(self, state: SchedulerState, now: float, shortage: Callable[[], str]) -> None:
@@ -98,7 +97,6 @@ class Computing:
             self._since_s = now
 
     def note(self, event: events.Event, state: SchedulerState, now: float) -> None:
-        """Note an event that the scheduler has handled; `state` is the one after it."""
         if isinstance(event, events.Compiled):
             self._compiled.add(event.kind)
             if self._since_s is None and event.kind in self._kinds and pending(state):
@@ -114,5 +112,4 @@ class Computing:
         self._since_s = None
 
     def seconds(self, now: float) -> float:
-        """The time until now."""
         return self._total_s + (0.0 if self._since_s is None else now - self._since_s)

@@ -78,7 +78,6 @@ class Trails:
         self._ways = [[] for _ in self._ways]
 
     def frame(self, lane: int) -> NDArray[np.uint8]:
-        """Picture of an environment, [256, 256, 3]."""
         picture, way = self._floor.copy(), self._ways[lane]
         if way:
             for column, row in self._line(way):
@@ -87,7 +86,6 @@ class Trails:
         return picture
 
     def _from_segment(self, start: NDArray, end: NDArray) -> NDArray:
-        """Distances of the pixels from a segment."""
         along, from_start = end - start, self._pixels - start
         part = np.clip(from_start @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
         return np.linalg.norm(from_start - part[..., None] * along, axis=-1)

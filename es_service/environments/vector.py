@@ -28,7 +28,6 @@ def observation_space(task: TaskSpec) -> Box:
 
 
 def action_space(task: TaskSpec) -> Box:
-    """Each number of an action is from -1 to 1."""
     return Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 

@@ -39,7 +39,6 @@ _NUMBERS: Mapping[Any, Any] = {int: np.int64, float: np.float64}
 
 
 def centre_path(index: int) -> str:
-    """Path of a centre."""
     return f"{CENTRES}/{index}"
 
 
@@ -50,7 +49,6 @@ def tree_of(state: RunState) -> dict[str, Any]:
 
 
 def stored(state: RunState) -> dict[str, Arrays]:
-    """All blocks of a state."""
     return {name: arrays for name, arrays in changes(state, None).items() if arrays is not None}
 
 
@@ -80,7 +78,6 @@ def new_names(state: RunState, before: RunState | None) -> frozenset[bytes]:
 
 
 def names_of(blocks: Changes) -> frozenset[bytes]:
-    """All names in some blocks."""
     return frozenset[bytes]().union(*(names_in(arrays) for arrays in blocks.values() if arrays is not None))
 
 
@@ -301,7 +298,6 @@ def _names(path: str, arrays: Arrays | None) -> list[str]:
 
 
 def _blocks(path: str, arrays: Arrays | None) -> dict[str, Arrays]:
-    """All blocks of a node."""
     if arrays is None or (rows := _rows(arrays)) is None:
         return {} if arrays is None else {path: arrays}
     return {name: _block(arrays, number, rows) for number, name in enumerate(_names(path, arrays))}

@@ -35,7 +35,6 @@ _REASONS: Mapping[str, Callable[[float], str]] = {
 
 
 def limits_of(budget: BudgetConfig) -> dict[str, float]:
-    """The limits that are set, by key of the budget."""
     return {key: limit for key in REACHED if (limit := getattr(budget, key)) is not None}
 
 
@@ -86,7 +85,6 @@ def only_started(limits: Mapping[str, float], row: Mapping[str, float]) -> bool:
 
 
 def _reached(limits: Mapping[str, float], row: Mapping[str, float]) -> list[str]:
-    """Keys of the limits that are reached."""
     return [key for key, limit in limits.items() if row.get(REACHED[key], -math.inf) >= limit]
 
 

@@ -222,7 +222,6 @@ class StatePolicies:
         return found
 
     def policy(self, name: bytes, spec: PolicySpec) -> Policy:
-        """A policy by its name; `spec`: what it is."""
         return stored_policy(spec, self.of([name])[name])
 
     def completed(self, asked: object, generation: int) -> object:

@@ -238,7 +238,6 @@ def propose(
 
 
 def _policy_of(state: SearchState, cell: int) -> bytes:
-    """Name of the policy of a filled cell."""
     assert state.map is not None
     return state.map.policy_N[state.map.row_of(cell)].tobytes()
 

@@ -238,7 +238,6 @@ def correct(
 
 
 def _episodes(search: Search, elites: PolicyAsk, generation: int, ask: int) -> Requests[EpisodesResult]:
-    """Results of some elites' episodes, [N, E]."""
     mean_N_O, std_N_O = elites.observation_mean_N_O, elites.observation_std_N_O
     assert mean_N_O is not None, "a stored policy has its statistics"
     assert std_N_O is not None

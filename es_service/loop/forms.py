@@ -65,7 +65,6 @@ class Sizes(NamedTuple):
 
     @property
     def lengths(self) -> dict[str, int]:
-        """Axis -> its length."""
         return {"D": self.parameters, "O": self.observation, "B": self.dimensions}
 
 

@@ -201,7 +201,6 @@ def episodes_of(
 
 
 def _computed(kind: type[AnyResult], work: Sequence[Work]) -> Requests[list[AnyResult]]:
-    """Results of chunks of one kind."""
     results = (yield work) if work else []
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"

@@ -42,12 +42,10 @@ def name_of(arrays: Arrays) -> bytes:
 
 
 def names(values: Iterable[bytes]) -> NDArray[Any]:
-    """An array of names."""
     return np.frombuffer(b"".join(values), NAME)
 
 
 def names_in(arrays: Arrays) -> frozenset[bytes]:
-    """All names in some arrays."""
     found = [name for array in arrays.values() if array.dtype == NAME for name in as_bytes(array)]
     return frozenset(found) - {NO_NAME}
 
@@ -117,7 +115,6 @@ class Cache(dict[Key, Value]):
                 self[key] = self.pop(key)
 
     def forget(self, key: Key) -> None:
-        """Forget a value if it is here."""
         if key in self:
             self.nbytes -= self._size_of(self.pop(key))
 
@@ -127,6 +124,5 @@ class Cache(dict[Key, Value]):
             self.forget(oldest)
 
     def clear(self) -> None:
-        """Forget all."""
         super().clear()
         self.nbytes = 0

@@ -84,7 +84,6 @@ def option_values(options: Mapping[str, Option], given: Mapping[str, object]) ->
 
 
 def defaults_of(options: Mapping[str, Option]) -> dict[str, OptionValue]:
-    """The defaults of all options that have one."""
     return {name: option.default for name, option in options.items() if option.default is not None}
 
 
@@ -148,8 +147,6 @@ FREE = (-1e300, 1e300)
 
 
 class ParameterSpec(NamedTuple):
-    """Parameters of a function, in their order."""
-
     names: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...]
     """(low, high), or FREE."""

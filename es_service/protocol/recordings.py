@@ -46,8 +46,6 @@ class RecordRequest:
 
 
 class Mesh(NamedTuple):
-    """A surface of triangles."""
-
     vertices_V_3: FloatArray
     """In the frame of a shape, in metres."""
     triangles_F_3: NDArray[np.int32]

@@ -73,7 +73,6 @@ def _remove(name: str) -> None:
 
 
 def _restore(name: str, module: ModuleType) -> None:
-    """Undo `_remove`."""
     sys.modules[name] = module
     package, _, child = name.rpartition(".")
     if package in sys.modules:
@@ -114,7 +113,6 @@ class _Finder:
         self._files = {name: own.file for name, own in modules.items() if own.file.suffix == ".py"}
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """The spec of a module, None if it is not one of them."""
         if (file := self._files.get(name)) is None:
             return None
         return importlib.util.spec_from_file_location(name, file, loader=_Loader(name, str(file)))

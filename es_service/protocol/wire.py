@@ -130,5 +130,4 @@ class Channel:
         return messages, is_open
 
     def close(self) -> None:
-        """Close the socket."""
         self._end.close()

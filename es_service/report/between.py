@@ -37,8 +37,6 @@ Ends = tuple[float, float]
 
 
 class Average(NamedTuple):
-    """A measure of one group."""
-
     group: str
     runs: int
     median: float
@@ -62,8 +60,6 @@ class Pair(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A measure of all groups."""
-
     name: str
     title: str
     lower_is_better: bool

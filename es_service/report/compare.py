@@ -190,7 +190,6 @@ def value_column(runs: Sequence[RunData]) -> str:
 
 
 def runs_of(groups: Sequence[Group]) -> list[RunData]:
-    """The runs of all groups."""
     return [run for group in groups for run in group.runs]
 
 

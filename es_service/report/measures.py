@@ -115,7 +115,6 @@ def has_curve(runs: Sequence[RunData], column: str) -> bool:
 
 
 def has_values(run: RunData, column: str) -> bool:
-    """Whether a run has a number in a column."""
     return bool(np.isfinite(run.history.get(column, np.zeros(0))).any())
 
 

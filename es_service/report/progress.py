@@ -88,7 +88,6 @@ class _InNotebook(JupyterMixin):
 
 
 def print_notice(console: Console, notice: str) -> None:
-    """Print a notice on a line of its own."""
     console.print(f"note: {notice}", soft_wrap=True)
 
 
@@ -132,7 +131,6 @@ def time_by_part(rows: deque[Row] | list[Row]) -> str:
 
 
 def plain_line(row: Row) -> str:
-    """One generation as one line."""
     return (
         f"generation {row['generation']}  {evaluated_word(row)} {row['centre_fitness_mean']:.2f}  "
         f"best {row['best_fitness']:.2f}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"

@@ -219,7 +219,6 @@ def weight_columns(generation_G: NDArray[np.float64], centres: HistoryColumns) -
 
 
 def axes_of(history: HistoryColumns) -> dict[str, str]:
-    """The axes of X_AXES that a run has."""
     return {
         column: label
         for column, label in X_AXES.items()

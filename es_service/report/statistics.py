@@ -112,7 +112,6 @@ class Difference(NamedTuple):
 
 
 def median(values: TaskValues) -> Any:
-    """The median of the values of all tasks, [W]."""
     return np.median(np.concatenate(values, axis=-1), axis=-1)
 
 

@@ -188,7 +188,6 @@ def faults(data: RunData) -> list[Fault]:
 
 
 def fault_sentence(faults: list[Fault]) -> str:
-    """The faults of a run in one sentence."""
     if not faults:
         return "No worker was lost and no chunk had to be sent again."
     lost, retries = sum(fault.lost_workers for fault in faults), sum(fault.retries for fault in faults)
@@ -200,7 +199,6 @@ def fault_sentence(faults: list[Fault]) -> str:
 
 
 def time_sentence(data: RunData) -> str:
-    """Where the time of the run went, in one sentence."""
     seconds = phase_seconds(data.history)
     total = sum(seconds.values())
     if not total:

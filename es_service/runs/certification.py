@@ -60,8 +60,6 @@ TOP = 10
 
 @dataclass(frozen=True)
 class NamedPolicy:
-    """A candidate."""
-
     name: str
     policy: Policy
     generation: int | None = None

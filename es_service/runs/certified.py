@@ -317,7 +317,6 @@ def pairs_sentence(*, paired: bool) -> str:
 
 
 def arrays_of(episodes: StoredEpisodes) -> dict[str, NDArray[Any]]:
-    """The arrays of episodes by name, for the store."""
     return {name: array for name, array in vars(episodes).items() if array is not None}
 
 

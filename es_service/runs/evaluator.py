@@ -63,7 +63,6 @@ class Transitions:
     """[N, E]: number of steps of an episode."""
 
     def rows(self, policy: int, episode: int = 0) -> slice:
-        """The rows of an episode."""
         before = self.steps[:policy].sum(dtype=np.int64) + self.steps[policy, :episode].sum(dtype=np.int64)
         return slice(int(before), int(before + self.steps[policy, episode]))
 
@@ -246,7 +245,6 @@ def evaluator(
 
 
 def transitions_of(result: EpisodesResult) -> Transitions:
-    """The transitions of episodes [N, E]."""
     steps = result.of_steps
     return Transitions(
         observation=steps["observation"],
@@ -305,7 +303,6 @@ def _started(
     transitions: bool,
     on_output: Callable[[str], None],
 ) -> PolicyEvaluator:
-    """See `evaluator`."""
     config = evaluating_config(config, workers, engine, address)
     task = task_of(config)
     outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
@@ -339,7 +336,6 @@ def _tell_wait(shortage: str) -> None:
 
 
 def _floats(name: str, given: ArrayLike, allowed: str) -> FloatArray:
-    """An argument as a contiguous float32 array."""
     try:
         array = np.asarray(given)
         if array.dtype.kind not in "fiu":

@@ -157,7 +157,6 @@ def _with_centres(search: SearchState, change: Callable[[CentreState], CentreSta
 
 
 def _arrays_of(moments: Moments) -> dict[str, np.ndarray]:
-    """Observation statistics as arrays."""
     return {name: np.asarray(value) for name, value in vars(moments).items()}
 
 

@@ -145,7 +145,6 @@ def state(status: RunStatus) -> str:
 
 
 def how_to_continue(status: RunStatus) -> WayOut:
-    """The way to continue a run that is not running."""
     if status.run.constants["task.environment"] == CALLER:
         return WayOut("ask_tell", "continue it", str(status.run.folder))
     return WayOut("resume", "continue it", str(status.run.folder), more(status))

@@ -102,7 +102,6 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
 
 
 def _initial_centres(config: RunConfig, spec: WorkerSpec) -> list[Centre]:
-    """A centre for each population of a generation, or one."""
     search, zeros_O = config.search, np.zeros(spec.policy.widths[0], np.float32)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
     sigma = search.sigma if isinstance(search, PopulationConfig) else 0.0
@@ -110,7 +109,6 @@ def _initial_centres(config: RunConfig, spec: WorkerSpec) -> list[Centre]:
 
 
 def _phases(config: RunConfig) -> list[Phase]:
-    """The chunks of a generation."""
     if not isinstance(config.search, PopulationConfig):
         return [Phase(name, "PolicyChunk", chunks) for name, chunks in chunks_of_phases(config).items()]
     kinds = {"rollout": "TrainingChunk", "gradient": "GradientChunk", "evaluation": "EvaluationChunk"}
@@ -141,7 +139,6 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: Run
 
 
 def _steps(search: SearchConfig, answers: Mapping[str, ChunkResult]) -> float:
-    """Environment steps of a generation."""
     if not isinstance(search, PopulationConfig):
         answer = answers["PolicyChunk"]
         assert isinstance(answer, EpisodesResult), "policies have episodes"
@@ -188,8 +185,6 @@ def _chunk_costs(spec: WorkerSpec, works: Sequence[Sequence[Work]]) -> tuple[dic
 
 @dataclass(frozen=True)
 class _EchoSpec(WorkerSpec):
-    """What an `EchoActor` needs."""
-
     answers: dict[str, ChunkResult] = field(default_factory=dict)
     """Answer of each kind of chunk."""
 

@@ -46,12 +46,10 @@ class StoredEpisodes:
 
     @property
     def steps(self) -> int:
-        """Environment steps of all episodes."""
         return int(self.steps_E.sum())
 
     @property
     def count(self) -> int:
-        """Number of episodes."""
         return self.return_E.size
 
     def fitness(self, kind: str) -> NDArray[np.float64]:
@@ -59,7 +57,6 @@ class StoredEpisodes:
         return self.return_E if kind == "sum" else self.last_reward_E
 
     def mean_fitness(self, kind: str) -> float:
-        """Mean of `fitness`."""
         with np.errstate(invalid="ignore", over="ignore"):
             return float(self.fitness(kind).mean())
 

@@ -56,7 +56,6 @@ def policy_spec(meta: RunMeta) -> PolicySpec:
 
 
 def sizes_of(meta: RunMeta) -> Sizes:
-    """The sizes of a run's arrays."""
     dimensions, has_map = len(meta.task["descriptor_names"]), meta.constants["map.enabled"]
     cells = tuple(meta.constants["map.cells"] or ()) if has_map else None
     bounds = tuple((low, high) for low, high in meta.constants["map.bounds"] or ()) if has_map else ()
@@ -197,7 +196,6 @@ class Snapshot:
 
     @property
     def archive(self) -> NoveltyArchive:
-        """The novelty archive as arrays."""
         return value_of(NoveltyArchive, self.nodes, ARCHIVE)
 
     @property

@@ -179,8 +179,6 @@ LAST_WORDS_BYTES = 4000
 
 @dataclass(frozen=True)
 class SweptRun:
-    """A run of a sweep at one moment."""
-
     name: str
     """Its settings in the sweep, such as "sigma=0.05_seed=0"."""
     folder: Path
@@ -336,7 +334,6 @@ class _Running:
     """How it has failed, in words."""
 
     def has_ended(self) -> bool:
-        """Whether the command has ended."""
         while self.due and self.process.is_answered:
             self.due -= 1
             try:

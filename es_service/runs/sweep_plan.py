@@ -67,8 +67,6 @@ class Labelled(NamedTuple):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a sweep."""
-
     name: str
     """Its settings in the sweep, such as "sigma=0.05_seed=0"."""
     folder: Path

@@ -112,7 +112,6 @@ class TensorBoard:
         self._writer: Any = None
 
     def files(self) -> list[Path]:
-        """The event files of this run."""
         mark = f".{self._run.run_id}."
         there = self._folder.iterdir() if self._folder.is_dir() else ()
         return sorted(file for file in there if file.name.startswith("events.out.tfevents.") and mark in file.name)

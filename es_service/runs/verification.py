@@ -158,7 +158,6 @@ class _Comparison:
         self._contents: dict[bytes, Arrays] = {}
 
     def load(self) -> Mapping[str, Arrays]:
-        """The state at the beginning."""
         return self._run.at(self.generation).nodes
 
     def newest_history(self, count: int) -> list[HistoryRow]:

@@ -128,8 +128,6 @@ def on_this_machine(config: Mapping[str, Any], workers: int | None = None) -> di
 
 @dataclass(frozen=True)
 class Shares:
-    """The division of the cores."""
-
     at_once: int
     """Number of runs at a time."""
     workers: tuple[int | Literal["auto"], ...]

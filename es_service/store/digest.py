@@ -30,7 +30,6 @@ from es_service.store.verify import verify
 
 
 def digest_of(parts: Mapping[str, str]) -> str:
-    """Digest of a run, from its `digest_parts`."""
     lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(parts.items()))
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 

@@ -165,5 +165,4 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
 
 
 def quoted(name: str) -> str:
-    """A name as a quoted SQL identifier."""
     return '"' + name.replace('"', '""') + '"'

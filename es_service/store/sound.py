@@ -152,7 +152,6 @@ class Followed:
     def _named_by(
         self, connection: sqlite3.Connection, meta: RunMeta, parts: dict[str, Arrays], problems: list[str]
     ) -> dict[bytes, Arrays]:
-        """The contents that are wanted."""
         contents, damaged = {}, 0
         for name in self._named(meta, parts):
             try:

@@ -42,7 +42,6 @@ KeptRows = dict[str, dict[int, str]]
 
 
 def insert_state(connection: sqlite3.Connection, rows: Iterable[StateRow]) -> None:
-    """Store state rows."""
     connection.executemany("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", rows)
 
 
@@ -115,7 +114,6 @@ def content_of(name: object, payload: object) -> dict[str, NDArray[Any]] | None:
 
 
 def insert_contents(connection: sqlite3.Connection, contents: Iterable[tuple[bytes, Part]]) -> None:
-    """Store contents that are not stored."""
     rows = ((name, encode_part(arrays)) for name, arrays in contents)
     connection.executemany("INSERT INTO content VALUES (?, ?)", rows)
 

@@ -263,7 +263,6 @@ class RunStore:
 
     @property
     def next_certification(self) -> int:
-        """Number of the next certification."""
         with self._explaining("reading the certifications"):
             return next_certified_number(self._connection, self.meta.parent)
 

@@ -29,8 +29,6 @@ _DRAWING = ThreadPoolExecutor(4, "drawing")
 
 
 class Picture(NamedTuple):
-    """A page at one moment."""
-
     title: str
     sections: Mapping[str, Markup]
     """By id, in order; an empty one is no part of the page."""

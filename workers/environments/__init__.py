@@ -189,8 +189,8 @@ def make_host_task(
         TaskError: the task does not exist or cannot be used.
     """
     from workers.environments.declared import with_descriptor
-    from workers.environments.host_metrics import with_metrics
     from workers.environments.host_task import with_choices
+    from workers.environments.python_task import with_metrics
 
     kind, _, rest = name.partition(":")
     if kind == LIBRARY:

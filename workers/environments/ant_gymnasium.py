@@ -109,11 +109,9 @@ class MujocoAntEnv(gymnasium.Env[Any, Any]):
         return {"descriptor": self.data.qpos[:2].copy(), "is_success": bool(self._has_succeeded)}
 
     def _forces(self) -> NDArray:
-        """What observations end with."""
         return np.zeros(0)
 
     def _position(self) -> NDArray:
-        """What observations begin with."""
         raise NotImplementedError
 
     def _outcome(self, x_before: float, action_A: NDArray) -> tuple[float, bool]:

@@ -132,7 +132,6 @@ def _nearest_point(middle_2: Any, half_way_2: Any, half_2: Any) -> tuple[Any, ..
 
 
 def _capsule(pos: Any, half_way: Any, radius: Any, box_4: Any) -> Contacts:
-    """Both contacts of a capsule with a box."""
     middle_2, half_2, way_2 = pos[:2] - box_4[:2], box_4[2:], half_way[:2]
     _, place, out_2, corner_2 = _nearest_point(middle_2, way_2, half_2)
     steep_2 = jnp.maximum(jnp.abs(way_2), TINY)
@@ -158,7 +157,6 @@ def _capsule(pos: Any, half_way: Any, radius: Any, box_4: Any) -> Contacts:
 
 
 def _sphere(pos: Any, half_way: Any, radius: Any, box_4: Any) -> Contacts:
-    """The contact of a sphere with a box."""
     return jax.tree.map(lambda x: x[None], _ball(pos, radius, box_4))
 
 

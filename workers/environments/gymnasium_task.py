@@ -37,7 +37,6 @@ from es_service.protocol.sources import LIBRARY, OUR_ENVIRONMENTS, OUR_NAMESPACE
 from es_service.protocol.user_code import import_user_module, users_error, why_not_imported
 from workers.environments import TaskError
 from workers.environments.declared import describe_descriptor
-from workers.environments.host_metrics import missing_metrics, with_metrics
 from workers.environments.host_task import (
     LENGTH,
     HostTask,
@@ -50,6 +49,7 @@ from workers.environments.host_task import (
     with_choices,
     within_bounds,
 )
+from workers.environments.python_task import missing_metrics, with_metrics
 
 EPISODE_STEPS = 1000
 """Default length of an episode where the environment has no limit."""
@@ -299,24 +299,20 @@ class KeyedGenerator(np.random.Generator):
         self._key, self._next = reset_key_4, 0
 
     def random(self, size: Any = None, *more: Any, **named: Any) -> Any:
-        """Uniform variates in [0, 1)."""
         if more or named:
             return super().random(size, *more, **named)
         return self._drawn(uniforms, size)
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
-        """Uniform variates in [low, high)."""
         shape = np.broadcast_shapes(np.shape(low), np.shape(high)) if size is None else size
         return low + (np.asarray(high) - low) * self._drawn(uniforms, shape or None)
 
     def standard_normal(self, size: Any = None, *more: Any, **named: Any) -> Any:
-        """Standard normal variates."""
         if more or named:
             return super().standard_normal(size, *more, **named)
         return self._drawn(lambda key, at: normal_integers(np, key, at) / NORMAL_STD, size)
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
-        """Normal variates."""
         shape = np.broadcast_shapes(np.shape(loc), np.shape(scale)) if size is None else size
         return loc + scale * self.standard_normal(shape or None)
 

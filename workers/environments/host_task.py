@@ -53,7 +53,6 @@ class HostEpisode:
 
 
 def no_metrics(episode: HostEpisode) -> tuple[()]:
-    """The metrics of a task without any."""
     return ()
 
 
@@ -201,7 +200,6 @@ class HostEnvironment:
         return self._numbers("the value of metrics", self._task.metrics(self._episode), len(self._task.metric_names))
 
     def _number(self, key: str, value: Any) -> float:
-        """The value of a key of `info` that is a metric."""
         return self._numbers(f"info[{key!r}], which task.metrics names,", value, 1).item()
 
     def _require_info(self, method: str, info: Any) -> None:
@@ -244,7 +242,6 @@ class HostEnvironment:
 
 
 def length(episode: HostEpisode) -> float:
-    """Number of steps of an episode."""
     return float(episode.steps)
 
 

@@ -28,8 +28,6 @@ from workers.environments.mujoco_gym_parts import (
 
 
 class GymTask(NamedTuple):
-    """An environment of Gymnasium."""
-
     file: str
     """Name of the model's file in Gymnasium's package."""
     frame_skip: int

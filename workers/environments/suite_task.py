@@ -38,8 +38,6 @@ from workers.environments.user_task import words_in_place_of_keys
 
 @dataclass(frozen=True)
 class Suite:
-    """An environment of a suite."""
-
     name: str
     """As in `task.environment`."""
     reset: Callable[[Any], tuple[Any, Any]]
@@ -70,7 +68,6 @@ class Choices:
         return sum(self.counts)
 
     def of(self, action_A: Any, allowed_A: Any) -> Any:
-        """The suite's action."""
         action_A = jnp.where(allowed_A, action_A, -jnp.inf)
         ends = np.cumsum([0, *self.counts]).tolist()
         chosen = [jnp.argmax(action_A[start:end]).astype(jnp.int32) for start, end in pairwise(ends)]

@@ -33,8 +33,6 @@ class WallContact(NamedTuple):
 
 
 class WallRows(NamedTuple):
-    """Walls as arrays with a row for each."""
-
     start_W_2: Any
     end_W_2: Any
     way_W_2: Any

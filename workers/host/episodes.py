@@ -24,8 +24,6 @@ from workers.rollouts.backend import Episodes, FailedEpisode, observation_text, 
 
 
 class HostStep(NamedTuple):
-    """One step of an episode."""
-
     environment: HostEnvironment
     """The environment after the step."""
     before_O: FloatArray

@@ -46,15 +46,11 @@ class LaneResults(NamedTuple):
 
 
 class LaneCarry(NamedTuple):
-    """State of a lane."""
-
     state: Any
     success: Any
 
 
 class LaneFunctions(NamedTuple):
-    """The functions of one lane."""
-
     begin: Callable[[Any], tuple[LaneCarry, LaneResults]]
     """Function of the stream key of a reset."""
     step: Callable[[LaneCarry, Any], tuple[LaneCarry, LaneResults]]

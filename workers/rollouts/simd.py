@@ -36,7 +36,6 @@ class Simd(RolloutBackend):
         return super().why_not(task, policy)
 
     def why_not_here(self) -> str:
-        """What the processor lacks."""
         from workers.simd.backend.target import NoVectorsError, host_target
 
         try:

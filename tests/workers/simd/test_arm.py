@@ -27,7 +27,7 @@ from tests.workers.simd.rollouts import arguments, every_target, targets, task_s
 from workers.environments import make_environment
 from workers.simd.backend.native import require_same
 from workers.simd.backend.target import Target
-from workers.simd.episodes import compiled, kernel, rollout
+from workers.simd.episodes import compiled, kernel, noise_kernels, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr

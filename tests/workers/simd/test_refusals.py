@@ -16,7 +16,7 @@ from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.backend import emit
-from workers.simd.episodes import check, rollout
+from workers.simd.episodes import check, noise_kernels, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.indexing import MOST_CHOICES
 from workers.simd.frontend.tracer import PRIMITIVES

@@ -55,7 +55,6 @@ class FunctionBuilder:
         self._names = 0
 
     def do(self, instruction: str) -> None:
-        """Add an instruction that has no value."""
         self.lines.append(f"  {instruction}")
 
     def value(self, instruction: str) -> str:
@@ -72,7 +71,6 @@ class FunctionBuilder:
         return self.value(f"call {llvm_type} @{intrinsic}({', '.join(map(' '.join, arguments))})")
 
     def at(self, pointer: str, index: str | int, llvm_type: str) -> str:
-        """Pointer to element `index` of an array of a type."""
         return self.value(f"getelementptr {llvm_type}, ptr {pointer}, i64 {index}")
 
     def load(self, llvm_type: str, pointer: str, index: str | int = 0) -> str:
@@ -81,7 +79,6 @@ class FunctionBuilder:
         return self.value(f"load {llvm_type}, ptr {place}, align {self._alignment(llvm_type)}")
 
     def store(self, llvm_type: str, value: str, pointer: str, index: str | int = 0) -> None:
-        """Store a value as element `index` of an array of a type."""
         place = self.at(pointer, index, llvm_type)
         self.do(f"store {llvm_type} {value}, ptr {place}, align {self._alignment(llvm_type)}")
 

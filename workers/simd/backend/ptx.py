@@ -70,8 +70,6 @@ class Pointer(NamedTuple):
 
 
 class StepCall(NamedTuple):
-    """A call of a function in each step."""
-
     function: FunctionBuilder
     pointers: tuple[str, ...]
     """Names of the kernel's pointers that are its arguments."""
@@ -198,7 +196,6 @@ class QuickWriter(Writer):
         return self.root(*values) if name == "sqrt" else super().operation(name, values)
 
     def quotient(self, a: str, b: str) -> str:
-        """a / b."""
         minus_b, one = self.operation("neg", [b]), self.number(1.0)
         estimate = self.estimate("div", one, b)
         reciprocal = self.operation("fma", [estimate, self.operation("fma", [minus_b, estimate, one]), estimate])

@@ -375,7 +375,6 @@ def first_sums(bias: bool, biases: Names) -> Names:
 
 
 def activated(builder: FunctionBuilder, activation: Activation, values: Sequence[str]) -> Names:
-    """Vectors of the activation of each vector."""
     graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(len(values))]
     outputs = [activated_node(graph, activation, node) for node in nodes]

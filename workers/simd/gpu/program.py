@@ -50,8 +50,6 @@ BIAS_OF_BYTES = 128
 
 
 class GpuLayer(NamedTuple):
-    """A layer of the policy as a kernel."""
-
     name: str
     inputs: int
     tiles: int

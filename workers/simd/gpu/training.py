@@ -27,8 +27,6 @@ CHECKED = 8
 
 
 class _GpuMemory(NamedTuple):
-    """Memory of the GPU for a number of pairs."""
-
     noises: GpuArray
     seen: GpuArray
     hidden: tuple[GpuArray, GpuArray]

@@ -83,7 +83,6 @@ def with_sign_of(g: Graph, size: int, sign: int) -> int:
 
 
 def _nan_where_nan(g: Graph, x: int, y: int) -> int:
-    """y, or NaN where x is NaN."""
     return g.op("select", g.op("ne", x, x), x, y)
 
 

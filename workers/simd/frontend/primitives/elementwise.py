@@ -168,7 +168,6 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def _not(t: Tracer, x: Nodes) -> Nodes:
-    """Negation of bool nodes."""
     return t.map(lambda n: t.graph.op("xor", t.graph.const("b", True), n), x)
 
 
