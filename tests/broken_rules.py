@@ -179,7 +179,7 @@ OF_ME_ES, OF_RULES = "tests/laws/test_me_es.py", "tests/laws/test_update_rules.p
 OF_MAP_ELITES = "tests/laws/test_map_elites.py"
 KEPT, MEASURED = "es_service/search/maps/kept.py", "es_service/search/algorithms/measured.py"
 OF_MEASURED = "tests/laws/test_measured_elites.py"
-OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py tests/es_service/test_arrays.py"
+OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py tests/es_service/test_blocks.py"
 OF_ROLLOUT = "tests/workers/test_rollout.py"
 OF_SCHEDULER = "tests/es_service/test_scheduler.py tests/es_service/test_scheduler_workers.py"
 

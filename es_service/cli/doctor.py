@@ -35,7 +35,7 @@ from es_service.runs.session import same_descriptor
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.verification import compared, examined
 from es_service.store.folder import is_network_filesystem
-from workers.host.examine import STEPS, TRIED
+from workers.describe import MOST_STEPS, TRIED
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import NoVectorsError, host_target
 from workers.simd.episodes.kernel import compile_kernel
@@ -196,7 +196,7 @@ def task_findings(name: str) -> Iterator[Finding]:
             yield "FAIL", f"{name}: an episode of a random policy is invalid {fault}"
             return
     if same_B := answers[0]["same_descriptor_B"]:
-        short = f", which have at most {STEPS} steps" if task.episode_steps > STEPS else ""
+        short = f", which have at most {MOST_STEPS} steps" if task.episode_steps > MOST_STEPS else ""
         yield "note", same_descriptor(task, same_B, f"{TRIED} episodes of random policies{short}")
     if task.kind == "jax":
         yield "ok", "the observations and rewards of episodes of random policies are finite"

@@ -190,7 +190,7 @@ class ObjectivePart(Section):
     """What members are ranked by."""
 
     reads: ClassVar[tuple[str, ...]] = ()
-    """Outputs of episodes that it reads beside those of every result: names of `protocol.outputs.AT_THE_END`."""
+    """Outputs of episodes that it reads beside those of every result: names of `protocol.episodes.AT_THE_END`."""
 
 
 class FitnessObjective(ObjectivePart):

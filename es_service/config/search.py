@@ -173,7 +173,7 @@ class SearchConfig(Section):
         return ()
 
     def outputs(self) -> tuple[str, ...]:
-        """Outputs of episodes that it reads beside those of every result: names of `protocol.outputs.AT_THE_END`.
+        """Outputs of episodes that it reads beside those of every result: names of `protocol.episodes.AT_THE_END`.
 
         They are then in the `outputs` of each `EpisodesResult`, of populations and of evaluations.
         """

@@ -166,7 +166,7 @@ class WorkerSpec:
     descriptor_size: int = 0
     """How many numbers the descriptor has that the config chooses; 0 if it is the task's."""
     outputs: tuple[str, ...] = ()
-    """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
+    """Outputs of episodes besides those of every result; names of `protocol.episodes`."""
     keyed_resets: bool = False
     """Whether environments of Gymnasium draw the starts of policies' episodes with the noise of the reset keys, so that
     they are those of a task in JAX; no run does so."""

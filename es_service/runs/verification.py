@@ -259,20 +259,20 @@ def _differing(engine: Evaluator, config: RunConfig, policy: Certified, then: St
 
 
 ALONE = "alone"
-"""Name of the first episode among the hashes of `workers.host.examine`."""
+"""Name of the first episode among the hashes of `workers.describe`."""
 LONGEST_S = 600.0
 """Longest time of each of the two processes; functions may take long."""
 
 
 def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-    """What `workers.host.examine` finds of a task of Python objects or a function in a process of its own.
+    """What `workers.describe` finds of a task of Python objects or a function in a process of its own.
 
     Args:
         settings: see `settings_of_description`.
         seconds: duration of its measurement.
     """
     try:
-        return answer_of("workers.host.examine:examiner", name, settings, request=(seconds,), limit_s=LONGEST_S)
+        return answer_of("workers.describe:examiner", name, settings, request=(seconds,), limit_s=LONGEST_S)
     except RaisedError as error:
         return {"problem": error.message}
     except NoAnswerError as error:

@@ -214,7 +214,7 @@ class RunStore:
             self._hook("mid_transaction")
             insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
             if recorded:
-                metrics.record(connection, generation, recorded)
+                record_metrics(connection, generation, recorded)
             if self._recorded:
                 store_platform_list(connection)
             self._hook("before_commit")

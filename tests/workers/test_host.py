@@ -36,12 +36,11 @@ from es_service.runs.replay import record
 from tests.helpers import centre, inline_here, random_parameters, spec, workers_in_this_process
 from tests.system.processes import is_running
 from tests.workers import host_tasks
-from workers.describe import does_not_repeat
+from workers.describe import does_not_repeat, examine
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.environments.gymnasium_task import KeyedGenerator
 from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import EnvironmentPool
-from workers.host.examine import examine
 from workers.policies.policy import LanePolicies
 from workers.worker import make_worker
 

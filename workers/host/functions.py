@@ -186,7 +186,7 @@ def _called(
 
 
 def _output(name: str, fitness_L: FloatArray, metrics_L_M: FloatArray) -> Any:
-    """The outputs of a call that `protocol.outputs` names."""
+    """The outputs of a call that `protocol.episodes` names."""
     if name == "last_reward":
         return fitness_L
     if name == METRICS:

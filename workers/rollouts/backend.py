@@ -64,9 +64,9 @@ class Episodes(NamedTuple):
     """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
     the episode's maximal number of steps, or at its end if it ended before."""
     outputs: dict[str, Any]
-    """Outputs that the run names, by name (`protocol.outputs.AT_THE_END`)."""
+    """Outputs that the run names, by name (`protocol.episodes.AT_THE_END`)."""
     of_steps: dict[str, Any]
-    """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.outputs.OF_STEPS`). Rows from `steps`
+    """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.episodes.OF_STEPS`). Rows from `steps`
     on may be anything."""
     fault: Any = None
     """[..., 2] int32 of a JAX task: the step, counted from 1, in which something first was not finite, and what: the

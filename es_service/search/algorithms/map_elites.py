@@ -8,7 +8,7 @@ y, which are drawn with equal probability from all filled cells, and is their is
 
 a has a standard normal variate for each parameter, b is a single one. The default standard deviations 0.005 and 0.05
 are those of the examples of QDax. Both parents may be the same elite. The policies are asked for as recipes, which
-workers follow: only the parents travel, once to each worker (`protocol.recipes`).
+workers follow: only the parents travel, once to each worker (`protocol.policies`).
 
 The map begins with `centres` random policies, which are the initial centres; later they matter only as elites. Our own
 choices: while the map is empty (a fork emptied it), the parents are these. Policies run with mean 0 and standard
