@@ -43,8 +43,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
     evaluation_chunks,
 )
-from es_service.protocol.policies import Policies
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.policies import Policies, Recipes
 from es_service.protocol.sent import Received
 from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
@@ -54,7 +53,7 @@ from es_service.store.create import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
-from workers.compilable import Compilable
+from workers.compiling import Compilable
 from workers.cores import parts
 from workers.policies.policy import initial_parameters
 from workers.reports import Reports
