@@ -40,7 +40,7 @@ BUDGET_S = {
     "docker/README.md": 10,
     "es_service/README.md": 100,
     "workers/README.md": 100,
-    "workers/own_tasks.md": 100,
+    "workers/own_tasks.md": 200,
     "workers/other_suites.md": 100,
     "workers/policies.md": 100,
     "tests/README.md": 10,
