@@ -50,7 +50,10 @@ BUDGET_S = {
     "CONTRIBUTING.md": 10,
 }
 """Guide -> seconds that all its commands may take together, several times what they take on two idle cores."""
-LOOKED_AT = (*BUDGET_S, TUTORIAL, "CHANGELOG.md", "workers/simd/README.md")
+LOOKED_AT = (
+    *(*BUDGET_S, TUTORIAL, "CHANGELOG.md", "workers/simd/README.md"),
+    *(f"tests/benchmarks/{folder}/README.md" for folder in ("baselines", "gpu")),
+)
 """Guides whose links and names are checked."""
 TEXT = {guide: (ROOT / guide).read_text() for guide in LOOKED_AT}
 
