@@ -18,6 +18,9 @@ from typing import Any
 from es_service.protocol.machine import cpu_kind, processor_fields
 from workers.simd.backend.cache import cache_folder
 
+MOST_BYTES = 200 * 2**20
+"""Size above which JAX removes the least recently used entries."""
+
 
 @dataclass(frozen=True)
 class Compilable:
@@ -43,10 +46,6 @@ def jitted(function: Callable[..., Any]) -> Compilable:
 
     run = jax.jit(function)
     return Compilable(run, lambda *arguments: run.lower(*arguments).compile())
-
-
-MOST_BYTES = 200 * 2**20
-"""Size above which JAX removes the least recently used entries."""
 
 
 def xla_cache_settings() -> dict[str, str]:

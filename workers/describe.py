@@ -38,6 +38,16 @@ TRIAL_STEPS = 60
 TRIAL_S = 0.5
 """Time after which a trial does no further step, so that a slow simulator is described soon."""
 SEED, OTHER_SEED = 1, 2
+MOST_STEPS = 200
+"""Most steps of an episode that is compared."""
+BESIDE = 3
+"""Objects that step beside the first."""
+TRIED = 8
+"""Random policies that are tried."""
+EXTREME = np.float32(30.0)
+"""Factor of the parameters of initial policies with which their actions are both small and great."""
+ALONE = "alone"
+"""Name of the first episode among the hashes; the others are to equal it."""
 
 
 def _random_actions(made: HostTask, task: TaskSpec, steps: int) -> Any:
@@ -129,18 +139,6 @@ def descriptions(name: str, settings: Mapping[str, Any]) -> Callable[[str], Any]
             return json.dumps({"problem": str(error)})
 
     return answer
-
-
-MOST_STEPS = 200
-"""Most steps of an episode that is compared."""
-BESIDE = 3
-"""Objects that step beside the first."""
-TRIED = 8
-"""Random policies that are tried."""
-EXTREME = np.float32(30.0)
-"""Factor of the parameters of initial policies with which their actions are both small and great."""
-ALONE = "alone"
-"""Name of the first episode among the hashes; the others are to equal it."""
 
 
 @dataclass(frozen=True)

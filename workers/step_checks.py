@@ -26,6 +26,11 @@ from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import jaxpr_digest
 from workers.simd.graph.graph import UnsupportedError
 
+LANES = 256
+"""Environments side by side."""
+STEPS = 40
+"""Control steps with random actions, over which the states that are compared are spread."""
+
 
 def require_pure(task: TaskSpec, options: Mapping[str, OptionValue]) -> None:
     """Raise TaskError if a method of a task in JAX computes something else when it is traced again.
@@ -72,12 +77,6 @@ def _digests(environment: Environment, task: TaskSpec) -> dict[str, str]:
         "goal_distance": traced(environment.goal_distance, state)[0],
         "success": traced(environment.success, state, before)[0],
     }
-
-
-LANES = 256
-"""Environments side by side."""
-STEPS = 40
-"""Control steps with random actions, over which the states that are compared are spread."""
 
 
 @dataclass(frozen=True)

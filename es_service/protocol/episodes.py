@@ -48,6 +48,10 @@ NAME_OF_METRIC = "[A-Za-z][A-Za-z0-9_]{0,39}"
 """Regular expression of METRIC_FORM."""
 CHOSEN_METRIC = f"^{NAME_OF_METRIC}(:({'|'.join(TAKEN)}))?$"
 """Regular expression of a metric that a config chooses: KEY, or KEY:TAKEN."""
+ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
+"""Arrays that every result has."""
+INFEASIBLE = "if -inf says that the point is infeasible, set search.allow_infeasible = true"
+"""The end of a message about a fitness of -inf, which is invalid unless the config allows infeasible points."""
 
 
 def wrong_metric_names(names: Collection[object]) -> list[str]:
@@ -56,12 +60,6 @@ def wrong_metric_names(names: Collection[object]) -> list[str]:
     wrong = [repr(name) for name in names if not isinstance(name, str) or not re.fullmatch(NAME_OF_METRIC, name)]
     folded = [str(name).casefold() for name in names]
     return wrong or [repr(name) for name in names if folded.count(str(name).casefold()) > 1]
-
-
-ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
-"""Arrays that every result has."""
-INFEASIBLE = "if -inf says that the point is infeasible, set search.allow_infeasible = true"
-"""The end of a message about a fitness of -inf, which is invalid unless the config allows infeasible points."""
 
 
 def addressed(work: Work, result: EpisodesResult, failures: tuple[str, ...] = ()) -> EpisodesResult:

@@ -30,6 +30,11 @@ TOGETHER = 8
 LARGEST_NOISE = 8.0
 """Bound of the magnitude of a normal variate of `protocol.noise`."""
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
+POLICY_SLOTS = 16
+"""Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
+compiled never changes."""
+POLICIES_TOGETHER = 8 * POLICY_SLOTS
+"""Most slots in one call of a kernel: a call costs little then, and the memory of the weights stays small."""
 
 
 class IsoLine(NamedTuple):
@@ -187,7 +192,7 @@ def recipes_of(
     """
     if isinstance(parents, np.ndarray) and parents.dtype == NAME:
         return Recipes(rule, tuple(as_bytes(parents)), (), parent_N_2, key_N_4)
-    return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
+    return Recipes(rule, tuple(map(parent_name, parents)), tuple(parents), parent_N_2, key_N_4)
 
 
 def unvaried(policies: Sequence[FloatArray] | NDArray[Any]) -> Recipes:
@@ -196,7 +201,7 @@ def unvaried(policies: Sequence[FloatArray] | NDArray[Any]) -> Recipes:
     return recipes_of(IsoLine(0.0, 0.0), policies, itself_N_2, np.zeros((len(policies), KEY_WORDS), np.uint32))
 
 
-def name_of(parameters_D: FloatArray) -> bytes:
+def parent_name(parameters_D: FloatArray) -> bytes:
     """Name of a policy by its content.
 
     Raises:
@@ -244,13 +249,6 @@ def _cannot_change(array: FloatArray) -> bool:
             return False
         memory = memory.base
     return memory is None or isinstance(memory, bytes)
-
-
-POLICY_SLOTS = 16
-"""Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
-compiled never changes."""
-POLICIES_TOGETHER = 8 * POLICY_SLOTS
-"""Most slots in one call of a kernel: a call costs little then, and the memory of the weights stays small."""
 
 
 @dataclass(frozen=True)

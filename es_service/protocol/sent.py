@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.content import Cache
 from es_service.protocol.messages import FloatArray, Work, recipes_in
-from es_service.protocol.policies import Origin, Policies, Recipes, name_of, recipes_again
+from es_service.protocol.policies import Origin, Policies, Recipes, parent_name, recipes_again
 
 Value = TypeVar("Value")
 
@@ -90,7 +90,7 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
         else:
             array: Any = subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
             shape = b"" if array.ndim == 1 else repr(array.shape).encode()  # [1, D] has the bits of [D]
-            named = {name_of(array) + shape: array} if array.nbytes >= LEAST_BYTES else {}
+            named = {parent_name(array) + shape: array} if array.nbytes >= LEAST_BYTES else {}
         needed |= named
         names |= {id(array): name for name, array in named.items()}
     arrays: dict[bytes, FloatArray] = {}

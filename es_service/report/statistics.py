@@ -29,6 +29,16 @@ from es_service.runs.selection import LEVEL
 
 WHOLE_RANGE = 5
 """With at most so many seeds, the interval reaches from the lowest to the highest value."""
+MOST_COUNTED = 20_000
+"""Most ways to draw runs, or to share them out between two groups, that are all counted."""
+DRAWS = 20_000
+TRIM = 0.25
+"""Share of the values that an interquartile mean leaves out at each end."""
+Array = NDArray[np.float64]
+TaskValues = Sequence[Array]
+"""Values of the runs of a group, an array for each task."""
+Statistic = Callable[[TaskValues], Any]
+"""A number of each way [W] to draw runs, from their values [W, R] of each task."""
 
 
 def median_interval(y_R_K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -79,19 +89,6 @@ def _medians(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.flo
                 count[i, j] = least * greatest[i - 1]
     ranks_M_2 = np.array(list(count)) - 1
     return ranks_M_2[:, 0], ranks_M_2[:, 1], np.array([number / n**n for number in count.values()])
-
-
-MOST_COUNTED = 20_000
-"""Most ways to draw runs, or to share them out between two groups, that are all counted."""
-DRAWS = 20_000
-TRIM = 0.25
-"""Share of the values that an interquartile mean leaves out at each end."""
-
-Array = NDArray[np.float64]
-TaskValues = Sequence[Array]
-"""Values of the runs of a group, an array for each task."""
-Statistic = Callable[[TaskValues], Any]
-"""A number of each way [W] to draw runs, from their values [W, R] of each task."""
 
 
 class Difference(NamedTuple):

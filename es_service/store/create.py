@@ -48,6 +48,9 @@ from es_service.store.states import insert_contents, insert_state
 
 SEVERAL = "centre_K_D"
 """Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""
+_NEW_DATABASE = "run.db.new"
+_LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
+"""Files that a killed creation in an existing folder may leave, which the next creation may overwrite."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +102,6 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
             record_metrics(connection, generation, new)
         if beginning.start is not None:
             put_meta(connection, START, base64.b64encode(encode_part(beginning.start)).decode())
-
-
-_NEW_DATABASE = "run.db.new"
-_LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
-"""Files that a killed creation in an existing folder may leave, which the next creation may overwrite."""
 
 
 def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:

@@ -39,6 +39,13 @@ START = "start"
 _PLATFORM_LIST = "platforms"
 """Key of the list of the rows' generations in the table `meta`, by which the loss of a row is noticed. Older versions
 neither store nor read it."""
+_MetricsByName = dict[Annotated[str, StringConstraints(pattern=f"^{NAME_OF_METRIC}$")], Finite]
+CERTIFICATIONS = "certifications"
+"""Key of a run's `RunMeta.parent`: number of the next certification of the parent when this run began."""
+_REMOVED_FACTS = ""
+"""Facts of a row that was damaged."""
+CertifiedKey = tuple[int, int]
+"""(number of a certification of the run, from 0; rank in it)."""
 
 
 def record_platform(connection: sqlite3.Connection, generation: int, platform: dict[str, Any]) -> bool:
@@ -96,9 +103,6 @@ def load_start(connection: sqlite3.Connection) -> dict[str, NDArray[Any]] | None
         return None if text is None else decode_part(base64.b64decode(text))
     except ValueError as error:
         raise Damaged(f"the policy from which it started cannot be read: {error}") from error
-
-
-_MetricsByName = dict[Annotated[str, StringConstraints(pattern=f"^{NAME_OF_METRIC}$")], Finite]
 
 
 def record_metrics(connection: sqlite3.Connection, generation: int, named: Mapping[str, float]) -> None:
@@ -171,14 +175,6 @@ def remove_metrics(connection: sqlite3.Connection, newest: int) -> None:
 def has_metrics(connection: sqlite3.Connection) -> bool:
     """Whether the run has their table."""
     return connection.execute("SELECT count(*) FROM sqlite_schema WHERE name = 'metric'").fetchone()[0] > 0
-
-
-CERTIFICATIONS = "certifications"
-"""Key of a run's `RunMeta.parent`: number of the next certification of the parent when this run began."""
-_REMOVED_FACTS = ""
-"""Facts of a row that was damaged."""
-CertifiedKey = tuple[int, int]
-"""(number of a certification of the run, from 0; rank in it)."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,13 @@ from es_service.loop.history import NO_INTEGER, Column, Row, Table
 from es_service.store.codec import INTEGER, REAL, RowValues, column_bytes, row_sha256, row_values
 from es_service.store.schema import OWN_HISTORY_COLUMNS, RunMeta, quoted
 
+Columns = dict[str, NDArray[Any]]
+"""Column name -> its values, [N]: float64, in which NaN stands for no value, or a masked array of int64."""
+_MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
+"""A value of a row as its bytes are, if there is one."""
+_VALUE = b"(?:N|[IR].{8})"
+"""Regular expression of a value's bytes."""
+
 
 class StoredRow(NamedTuple):
     """A history row as it is stored; a damaged one may hold values of any type."""
@@ -91,14 +98,6 @@ def row_is_sound(columns: bytes, row: StoredRow) -> bool:
 def newest_generation(connection: sqlite3.Connection) -> int | None:
     """Newest generation of the history; None if it is empty."""
     return connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-
-
-Columns = dict[str, NDArray[Any]]
-"""Column name -> its values, [N]: float64, in which NaN stands for no value, or a masked array of int64."""
-_MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
-"""A value of a row as its bytes are, if there is one."""
-_VALUE = b"(?:N|[IR].{8})"
-"""Regular expression of a value's bytes."""
 
 
 class GrowingTable:

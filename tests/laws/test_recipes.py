@@ -20,7 +20,7 @@ from es_service.protocol.policies import (
     Origin,
     PolicyChunk,
     Recipes,
-    name_of,
+    parent_name,
     recipes_again,
     recipes_of,
     unvaried,
@@ -81,13 +81,13 @@ def test_the_driver_makes_a_policy_with_the_bits_that_a_worker_makes():
 
 def test_a_name_is_that_of_the_content():
     one, other = PARENTS[0].copy(), PARENTS[0].copy()
-    assert name_of(one) == name_of(other)
-    before = name_of(one)
+    assert parent_name(one) == parent_name(other)
+    before = parent_name(one)
     one[3] += 1.0  # it was writable, so nothing of it is remembered
-    assert name_of(one) != before
+    assert parent_name(one) != before
     one.flags.writeable = False
-    assert name_of(one) == name_of(one.copy()) != before
-    assert len({name_of(parent) for parent in PARENTS}) == len(PARENTS)
+    assert parent_name(one) == parent_name(one.copy()) != before
+    assert len({parent_name(parent) for parent in PARENTS}) == len(PARENTS)
 
 
 @pytest.mark.parametrize("view", [lambda array: array[:], lambda array: array[2:].view(), np.broadcast_to])
@@ -95,9 +95,9 @@ def test_the_name_of_a_read_only_view_follows_the_array_that_is_seen_through_it(
     array = PARENTS[0].copy()
     seen = view(array, array.shape) if view is np.broadcast_to else view(array)
     seen.flags.writeable = False
-    before = name_of(seen)
+    before = parent_name(seen)
     array[3] += 1.0
-    assert name_of(seen) == name_of(seen.copy()) != before
+    assert parent_name(seen) == parent_name(seen.copy()) != before
 
 
 def test_an_array_that_cannot_change_is_hashed_once(monkeypatch):
@@ -105,9 +105,9 @@ def test_an_array_that_cannot_change_is_hashed_once(monkeypatch):
     for array in arrays[:2]:
         array.flags.writeable = False
     kept = [arrays[0], arrays[1][1], arrays[2]]
-    names = [*map(name_of, kept)]
+    names = [*map(parent_name, kept)]
     monkeypatch.setattr(hashlib, "sha256", None)
-    assert [*map(name_of, kept)] == names
+    assert [*map(parent_name, kept)] == names
 
 
 # What travels
@@ -118,7 +118,7 @@ def test_no_parameters_travel_with_an_item():
     sent = parcel(work, Memory(2**40, int))
     assert len(sent.work) < 3000 < PARENTS[0].nbytes * 20
     received = Received(2**40, Recipes.made)
-    received.add(dict(zip(map(name_of, PARENTS), PARENTS, strict=True)))
+    received.add(dict(zip(map(parent_name, PARENTS), PARENTS, strict=True)))
     assert made(received.work({}, sent.work)) == made(work)
 
 
@@ -201,7 +201,7 @@ def test_what_a_sender_does_not_know_of_is_forgotten_first():
 def born(work, number, origins):
     """One of the policies that are asked for, whose origin is then known."""
     parameters_D = work.policies([number], SHAPE)[0].parameters_D
-    origins |= work.parameters_N_D.part([number]).origins_of([name_of(parameters_D)])
+    origins |= work.parameters_N_D.part([number]).origins_of([parent_name(parameters_D)])
     return parameters_D
 
 
@@ -255,8 +255,8 @@ def test_a_small_parent_travels_itself():
 
 def test_a_policy_has_the_origin_of_which_it_was_made():
     asked = recipes(5, 77)
-    name = name_of(asked.made()[3])
-    origin = asked.origins_of([*map(name_of, asked.made())])[name]
+    name = parent_name(asked.made()[3])
+    origin = asked.origins_of([*map(parent_name, asked.made())])[name]
     known = dict(zip(asked.names, asked.parents, strict=True))
     assert bits(recipes_again([origin], known).made()[0]) == bits(asked.made()[3])
 
@@ -267,7 +267,7 @@ def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
     recipes = unvaried(policies)
     made_N_D = recipes.made()
     np.testing.assert_array_equal(made_N_D, policies)
-    assert recipes.names == tuple(map(name_of, made_N_D))
+    assert recipes.names == tuple(map(parent_name, made_N_D))
     assert recipes.origins_of(recipes.names) == {}
 
 

@@ -34,6 +34,8 @@ SHORTEST = 1e-15
 """Least length of a vector that has a direction, in metres, as in C MuJoCo (`mjMINVAL`)."""
 HALVINGS = 24
 """Halvings of a capsule's axis, after which a point is known to a float32 ulp of its length."""
+AT_ONCE = 4
+"""Active contacts of each `condim` that are solved without the places of the others, if there are more places."""
 
 
 @contextlib.contextmanager
@@ -108,10 +110,6 @@ def _from_cylinder(point: Any, size: Any) -> tuple[Any, Any]:
     from_corner = (beside * radial + beyond * axial) / jnp.maximum(corner, SHORTEST)
     direction = jnp.where(beside > beyond, radial, axial)
     return jnp.where(is_corner, corner, jnp.maximum(beside, beyond)), jnp.where(is_corner, from_corner, direction)
-
-
-AT_ONCE = 4
-"""Active contacts of each `condim` that are solved without the places of the others, if there are more places."""
 
 
 def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:

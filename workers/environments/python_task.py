@@ -78,6 +78,14 @@ KNOWN = (*SIZES, *METHODS, *DESCRIPTOR, *OF_EVERY_CLASS, "descriptor", "action_b
 KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", *KEPT_ATTRIBUTES)
 """Attributes that a constructor must not change."""
 PREFIX = "python:"
+_OF_VALUES: Mapping[str, Callable[[Any], Any]] = {
+    "last": lambda values: values[-1],
+    "sum": np.sum,
+    "mean": np.mean,
+    "min": np.min,
+    "max": np.max,
+}
+assert (*_OF_VALUES,) == TAKEN
 
 
 def describe(
@@ -193,16 +201,6 @@ def _wrong_actions(task: Any) -> list[str]:
     if not wrong and len(pairs) not in (1, size):
         wrong.append(f"action_bounds has {len(pairs)} pairs, but action_size is {size}")
     return wrong
-
-
-_OF_VALUES: Mapping[str, Callable[[Any], Any]] = {
-    "last": lambda values: values[-1],
-    "sum": np.sum,
-    "mean": np.mean,
-    "min": np.min,
-    "max": np.max,
-}
-assert (*_OF_VALUES,) == TAKEN
 
 
 def with_metrics(task: HostTask, choices: HostChoices) -> HostTask:

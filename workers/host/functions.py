@@ -31,6 +31,14 @@ PRINTED_BYTES = 500
 """At most this many bytes of what a call has printed are told if it ends its process, or takes too long."""
 START_S = 120.0
 """Longest time in which the process of a function must have imported it."""
+SHOWN = 12
+"""Most parameters that a failure names in the driver's log; the output of the worker has all of them."""
+LONGEST = 1000
+"""Longest reason of a failure there, in characters."""
+POINTS = 2
+"""Points of a trace, of an episode with one step."""
+TaskCall = Callable[[FloatArray, int], tuple[float, Any, Any]]
+"""Function (parameters [D], seed) -> (fitness, descriptor [B], metrics [M])."""
 
 
 class CallFailedError(Exception):
@@ -85,16 +93,6 @@ class Caller:
             raise CallFailedError(f"its process {error}{key if error.is_late else ''}{said}") from None
         except RaisedError as error:
             raise CallFailedError(error.message) from None
-
-
-SHOWN = 12
-"""Most parameters that a failure names in the driver's log; the output of the worker has all of them."""
-LONGEST = 1000
-"""Longest reason of a failure there, in characters."""
-POINTS = 2
-"""Points of a trace, of an episode with one step."""
-TaskCall = Callable[[FloatArray, int], tuple[float, Any, Any]]
-"""Function (parameters [D], seed) -> (fitness, descriptor [B], metrics [M])."""
 
 
 def run_calls(

@@ -43,6 +43,8 @@ from workers.simd.episodes.kernel import Kernel, compile_kernel
 from workers.simd.graph.graph import Graph, UnsupportedError
 
 __all__ = ["LaneResults", "Lanes", "LanesState", "task_named"]
+LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint32], LaneResults]]
+"""Function of lanes and their reset keys [M, 4] -> (words of their carries [M, words], what is seen in them)."""
 
 
 class LanesState(NamedTuple):
@@ -186,10 +188,6 @@ def _say_once(name: str, lacks: str, *, whole: bool) -> None:
     """Warn that lanes are slower than those of other tasks, and have the bits of this kind of processor."""
     what = "computes it" if whole else "computes its resets"
     warnings.warn(f"{name}: xla {what} in a process of its own, since simd cannot compile {lacks}", stacklevel=4)
-
-
-LaneResets = Callable[[NDArray[np.intp], NDArray[np.uint32]], tuple[NDArray[np.uint32], LaneResults]]
-"""Function of lanes and their reset keys [M, 4] -> (words of their carries [M, words], what is seen in them)."""
 
 
 class Kernels(NamedTuple):

@@ -25,6 +25,8 @@ from es_service.protocol.messages import SIGNS, FloatArray, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys, uniforms
 from es_service.protocol.policy_spec import Activation, Output, PolicySpec, noise_integers
 
+_SIGNS_S = np.asarray(SIGNS, np.float32)
+
 
 def dense(x: Any, weights: Any, biases: Any) -> Any:
     """x @ weights, plus the biases unless they are None."""
@@ -245,9 +247,6 @@ def _lane_layers(spec: WorkerSpec, parameters_L_D: FloatArray) -> Layers:
         of_biases = None if biases is None else parameters_L_D[:, None, biases[0] : biases[-1] + 1]
         layers.append((of_weights, of_biases))
     return layers
-
-
-_SIGNS_S = np.asarray(SIGNS, np.float32)
 
 
 def members(spec: WorkerSpec, centre_D: FloatArray, unit: Any, noise_keys_P_4: Any) -> FloatArray:
