@@ -13,7 +13,7 @@ from typing import Any
 from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
-from es_service.loop.interfaces import Stop as Stop
+from es_service.loop.state import Stop as Stop
 from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.machine import given_path
 from es_service.report.progress import in_notebook, show_in_notebook

@@ -108,7 +108,7 @@ class Values(Mapping[str, Any]):
     @property
     def policy(self) -> PolicySpec:
         """The policy. Raises Unknown."""
-        return policy_of(self, self.task.observation_size, self.task.action_size)
+        return policy_spec_of(self, self.task.observation_size, self.task.action_size)
 
     @property
     def on_gpu(self) -> bool:
@@ -207,7 +207,7 @@ def options_of(values: Mapping[str, Any]) -> dict[str, Any]:
     return {key.removeprefix(TASK_OPTIONS): value for key, value in values.items() if key.startswith(TASK_OPTIONS)}
 
 
-def policy_of(values: Mapping[str, Any], observation_size: int, action_size: int) -> PolicySpec:
+def policy_spec_of(values: Mapping[str, Any], observation_size: int, action_size: int) -> PolicySpec:
     """The policy that values of a config make, by dotted key; keys that are missing have their defaults."""
     names = ("hidden", "activation", "output", "bias", "memory")
     hidden, activation, output, bias, memory = (

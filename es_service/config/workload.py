@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from es_service.config.model import RunConfig
 from es_service.config.parts import RESOURCES
-from es_service.config.resolution import WITHOUT_PAIRS, default_chunk_pairs, policy_of
+from es_service.config.resolution import WITHOUT_PAIRS, default_chunk_pairs, policy_spec_of
 from es_service.config.rules import MOST_CHUNK_PAIRS
 from es_service.config.search import PopulationConfig
 from es_service.config.tasks import CALLER, ROLLOUTS
@@ -19,7 +19,7 @@ from es_service.protocol.sources import worker_sources
 def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
     """The policy of a run, from the task's observation to its action."""
     values = {f"policy.{name}": value for name, value in config.policy}
-    return policy_of(values, task.observation_size, task.action_size)
+    return policy_spec_of(values, task.observation_size, task.action_size)
 
 
 def require_episodes(task: TaskSpec, *, asks_caller: bool) -> None:

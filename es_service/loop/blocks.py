@@ -17,15 +17,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from es_service.loop.state import RunState
+from es_service.loop.state import Changes, RunState
 from es_service.protocol.content import NAME, NO_NAME, Arrays, as_bytes, names_in
 from es_service.search.algorithms.base import SearchState, frozen
 from es_service.search.arrays import same, same_rows
 
 Tree = Mapping[str, Arrays]
 """Path of a node -> its arrays; or name of a stored block -> its arrays."""
-Changes = Mapping[str, Arrays | None]
-"""Blocks that a generation has changed, by name; None for those that it has removed."""
 
 COUNTS, BEST, OBSERVATIONS, WEIGHT, MAP, GEOMETRY, ARCHIVE, CENTRES, EXTRA = (
     "counts", "best", "observations", "weight", "map", "map/geometry", "archive", "centres", "extra",

@@ -44,8 +44,7 @@ from es_service.loop.generation import (
     tell,
 )
 from es_service.loop.history import HistoryRow
-from es_service.loop.interfaces import Search, Stop, Store, Stored
-from es_service.loop.state import RunState
+from es_service.loop.state import RunState, Search, Stop, Store, Stored
 from es_service.protocol.episodes import DispatchCounts, Evaluator, OverlappedRequests, Requests, Value
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState

@@ -15,7 +15,7 @@ from es_service.loop.checks import valid_members
 from es_service.loop.contents import Named, PolicyWork, no_statistics, policy_work
 from es_service.loop.generation import episodes_of, first_episode, highest, results_in, steps_of
 from es_service.loop.history import CORRECTED, NO_POLICY, RESETS, HistoryRow, Table, doubles, episodes_table, with_gaps
-from es_service.loop.interfaces import Search
+from es_service.loop.state import Search
 from es_service.protocol.episodes import Requests, joined
 from es_service.protocol.messages import Centre, EpisodesResult, PolicySpec, TaskSpec
 from es_service.protocol.noise import Domain

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.blocks import Changes, changes, new_names
+from es_service.loop.blocks import changes, new_names
 from es_service.loop.budget import MOST_DURATIONS, Clock, durations
 from es_service.loop.checks import require_known, require_storable
 from es_service.loop.contents import Named
@@ -23,8 +23,7 @@ from es_service.loop.history import (
     or_none,
     population_columns,
 )
-from es_service.loop.interfaces import Search
-from es_service.loop.state import RunState, merge_moments
+from es_service.loop.state import Changes, RunState, Search, merge_moments
 from es_service.protocol.content import Contents
 from es_service.protocol.messages import EpisodesResult, Moments
 from es_service.search.algorithms.base import CentreEvaluations, SearchState

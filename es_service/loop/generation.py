@@ -18,8 +18,7 @@ from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError
 from es_service.loop.checks import require_columns, require_state
 from es_service.loop.contents import PolicyWork
-from es_service.loop.interfaces import Search
-from es_service.loop.state import NO_BEST, Best, RunState, statistics_in_force
+from es_service.loop.state import NO_BEST, Best, RunState, Search, statistics_in_force
 from es_service.protocol.episodes import Requests, gathered
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (

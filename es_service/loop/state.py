@@ -1,18 +1,26 @@
-"""Everything that a run carries from one generation to the next, with the statistics of observations."""
+"""What the loop works with: the definition of a run, the store in which it is kept, a request to stop, and everything
+that a run carries from one generation to the next, with the statistics of observations.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.content import NAME
-from es_service.protocol.messages import FloatArray, Moments
-from es_service.search.algorithms.base import CentreState, SearchState
+from es_service.config.model import RunConfig
+from es_service.errors import ConfigError
+from es_service.loop.history import HistoryRow, Table
+from es_service.protocol.content import NAME, Arrays, Contents
+from es_service.protocol.messages import FloatArray, Moments, TaskSpec
+from es_service.search.algorithms.base import Algorithm, CentreState, SearchState
+
+Changes = Mapping[str, Arrays | None]
+"""Blocks that a generation has changed, by name; None for those that it has removed."""
 
 # Running statistics of observations, merged by the driver in chunk order and in float64. Axis O: observation.
 
@@ -106,3 +114,64 @@ def statistics_in_force(
     if enabled and centre is not None and centre.own_mean_O is not None and centre.own_std_O is not None:
         return centre.own_mean_O, centre.own_std_O
     return normalisation(observations, enabled)
+
+
+class Stored(Protocol):
+    """What the loop reads from a run store: the state that earlier sessions have stored."""
+
+    @property
+    def generation(self) -> int | None:
+        """Newest committed generation; None before the first."""
+        ...
+
+    def load(self) -> Mapping[str, Arrays]: ...
+    def newest_history(self, count: int) -> Sequence[Mapping[str, Any]]: ...
+
+
+class Store(Protocol):
+    """What the loop needs from a run store during a run."""
+
+    def content(self, name: bytes) -> Arrays:
+        """A policy or a trace that a stored state names. Raises KeyError if there is none of this name."""
+        ...
+
+    def commit(
+        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table, contents: Contents
+    ) -> None:
+        """Take a generation, with the policies and traces that it names and no generation before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A request to end a session, returned by the function that is called with each committed history row."""
+
+    reason: str
+    """Why the session ends, in words."""
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    """Numbers to be recorded of this generation, by name; as if they had been returned alone."""
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError if there are no words, since every reader of the run shows them."""
+        if not isinstance(self.reason, str) or not self.reason.strip():
+            raise ConfigError(
+                f"Stop({self.reason!r}): the reason must be words that say why the session ends",
+                field="reason",
+                value=self.reason,
+                allowed="words",
+            )
+
+
+@dataclass(frozen=True)
+class Search:
+    """Definition of a run apart from where it runs: config, algorithm, starting point and task."""
+
+    config: RunConfig
+    algorithm: Algorithm
+    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
+    """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
+    another run."""
+    task: TaskSpec
+    statistics: Callable[[], Sequence[tuple[FloatArray, FloatArray]]] = lambda: ()
+    """Returns mean and standard deviation of observations, [O] each, that each initial centre keeps as its own; none if
+    they all use those of the whole run."""

@@ -297,13 +297,13 @@ def workers_for(
             can, and have their first observations.
     """
     task = task_of(config)
-    outputs = outputs_of(task)
+    outputs = certified_outputs(task)
     if compared and task.parameters is None:
         outputs = (*outputs, FIRST_OBSERVATION)
     return engine_here(config, on_notice, on_output, outputs=outputs, keyed_resets=compared)
 
 
-def outputs_of(task: TaskSpec) -> tuple[str, ...]:
+def certified_outputs(task: TaskSpec) -> tuple[str, ...]:
     """Outputs that the episodes of a certification name."""
     return ("last_reward", "success") if task.success else ("last_reward",)
 

@@ -29,7 +29,7 @@ from es_service.runs.selection import (
     interval_columns,
     share_gap_interval,
 )
-from es_service.runs.snapshot import policy_spec, sizes_of
+from es_service.runs.snapshot import sizes_of, stored_policy_spec
 from es_service.store.facts import Damaged, Form, require_form
 from es_service.store.reader import read_certifications, read_meta
 from es_service.store.records import CertifiedRow
@@ -377,7 +377,7 @@ def _from_row(folder: Path, row: CertifiedRow, meta: RunMeta) -> Certified:
     if found or not lengths["E"]:
         which = f"row {row.rank} of certification {row.number}"
         raise StoreError(f"{folder} is not what es-service writes: {which} {found or 'has no episodes'}", run=folder)
-    own: dict[str, Any] = {"policy": policy_of(policy_spec(meta), arrays)}
+    own: dict[str, Any] = {"policy": policy_of(stored_policy_spec(meta), arrays)}
     own |= {name: facts[name] for name in _FACTS if name in facts}
     of_episodes = {name: array for name, array in arrays.items() if name not in OF_POLICY}
     if (known := facts.get(_ELSEWHERE)) is not None:

@@ -8,8 +8,8 @@ from typing import Any
 from es_service.config.model import RunConfig
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, WayOut
-from es_service.loop.blocks import Changes
 from es_service.loop.history import HistoryRow, Table
+from es_service.loop.state import Changes
 from es_service.protocol.content import Contents
 from es_service.protocol.machine import CODE, computed_on, is_mixed, platform_info, without_code
 from es_service.protocol.sources import Sources, driver_sources, in_words, other_files, worker_sources

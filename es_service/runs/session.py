@@ -28,8 +28,7 @@ from es_service.errors import (
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.history import METRIC, evaluated_word
-from es_service.loop.interfaces import Stop
-from es_service.loop.state import no_observations
+from es_service.loop.state import Stop, no_observations
 from es_service.protocol.episodes import METRIC_FORM, DispatchCounts, OverlappedRequests, wrong_metric_names
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec

@@ -20,7 +20,7 @@ from es_service.config.workload import require_episodes
 from es_service.dispatch import events
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
-from es_service.loop.interfaces import Stop
+from es_service.loop.state import Stop
 from es_service.protocol.content import Policy
 from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.noise import Domain

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.resolution import policy_of
+from es_service.config.resolution import policy_spec_of
 from es_service.errors import NotInRunError, StoreError
 from es_service.loop.blocks import ARCHIVE, BEST, MAP, OBSERVATIONS, Tree, centre_path, joined, value_of
 from es_service.loop.contents import stored_elite, stored_policy
@@ -50,9 +50,9 @@ OF_CENTRES = {"centre": "INTEGER", "fitness_weight": "REAL", "fitness_mean": "RE
 """The same for the evaluated centres."""
 
 
-def policy_spec(meta: RunMeta) -> PolicySpec:
+def stored_policy_spec(meta: RunMeta) -> PolicySpec:
     """What a run's policies are."""
-    return policy_of(meta.constants, meta.task["observation_size"], meta.task["action_size"])
+    return policy_spec_of(meta.constants, meta.task["observation_size"], meta.task["action_size"])
 
 
 def sizes_of(meta: RunMeta) -> Sizes:
@@ -61,7 +61,7 @@ def sizes_of(meta: RunMeta) -> Sizes:
     bounds = tuple((low, high) for low, high in meta.constants["map.bounds"] or ()) if has_map else ()
     step, kinds = STEPS.get(meta.constants.get("search.step.kind") or ""), {"i": INTEGER, "f": REAL}
     of_step = {} if step is None else {name: kinds[array.dtype.kind] for name, array in step.fresh(1).items()}
-    return Sizes(policy_spec(meta).parameters, meta.task["observation_size"], dimensions, cells, bounds, of_step)
+    return Sizes(stored_policy_spec(meta).parameters, meta.task["observation_size"], dimensions, cells, bounds, of_step)
 
 
 def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:
@@ -257,7 +257,7 @@ class Snapshot:
         map_ = self.behaviour_map
         chosen = map_.cell_N.tolist() if cells is None else cells
         names = {cell: map_names(map_, [cell]) for cell in chosen}
-        spec = policy_spec(self.meta)
+        spec = stored_policy_spec(self.meta)
         elites = {
             cell: stored_elite(spec, *(self.contents[name] for name in of_cell)) for cell, of_cell in names.items()
         }
@@ -299,10 +299,12 @@ class Snapshot:
     def policy(self, which: Literal["best", "centre"]) -> Policy:
         """The best or the newest centre as a policy; see `Run.policy`."""
         if which == "best":
-            return acting(self.meta, stored_policy(policy_spec(self.meta), self.contents[self.best.policy.tobytes()]))
+            return acting(
+                self.meta, stored_policy(stored_policy_spec(self.meta), self.contents[self.best.policy.tobytes()])
+            )
         (centre, _), enabled = self.require_newest_centre(), self.meta.constants["policy.observation_normalization"]
         mean_O, std_O = statistics_in_force(value_of(Moments, self.nodes, OBSERVATIONS), centre, enabled)
-        return acting(self.meta, content.Policy(policy_spec(self.meta), centre.centre_D, mean_O, std_O))
+        return acting(self.meta, content.Policy(stored_policy_spec(self.meta), centre.centre_D, mean_O, std_O))
 
 
 def acting(meta: RunMeta, policy: content.Policy) -> Policy:

@@ -31,10 +31,10 @@ from es_service.runs.snapshot import (
     acting,
     descriptor_names,
     map_names,
-    policy_spec,
     sound_contents,
     sound_meta,
     sound_nodes,
+    stored_policy_spec,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
@@ -274,7 +274,7 @@ class Run:
     @property
     def policy_spec(self) -> PolicySpec:
         """What this run's policies are: their layers, memory and output."""
-        return policy_spec(self.meta)
+        return stored_policy_spec(self.meta)
 
     def policy(self, which: Literal["best", "centre", "certified"] | int | Sequence[int] = "best") -> Policy:
         """A policy of the run, with its observation statistics.

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
-from es_service.loop.blocks import Changes
 from es_service.loop.history import HistoryRow, Table
+from es_service.loop.state import Changes
 from es_service.protocol.content import Arrays, Contents
 from es_service.runs.identity import Recorder
 from es_service.store.folder import DATABASE

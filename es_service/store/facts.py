@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from es_service.config.model import COMPUTE_CONSTANTS
-from es_service.config.resolution import policy_of
+from es_service.config.resolution import policy_spec_of
 from es_service.loop.history import Column
 from es_service.protocol.messages import TaskSpec
 
@@ -152,7 +152,7 @@ class RunFacts(BaseModel):
         if not min(self.task.observation_size, self.task.action_size) >= 1:
             raise ValueError("the task has no observations or no actions")
         values = {f"policy.{name}": getattr(self.constants, f"policy__{name}") for name in POLICY}
-        spec = policy_of(values, self.task.observation_size, self.task.action_size)
+        spec = policy_spec_of(values, self.task.observation_size, self.task.action_size)
         if max(spec.widths) > MOST_PARAMETERS or spec.parameters > MOST_PARAMETERS:
             raise ValueError(f"the policy has more than {MOST_PARAMETERS} parameters")
         return self

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 
 from es_service import api
-from es_service.config.resolution import policy_of
+from es_service.config.resolution import policy_spec_of
 from es_service.errors import StoreError
 from es_service.runs.certification import certify_run
 from es_service.runs.export import arrays, export, tables
@@ -65,7 +65,7 @@ def test_a_model_has_the_actions_of_its_policy(kind, clip):
     """By onnxruntime, for episodes side by side, step by step."""
     rng = np.random.default_rng(0)
     values = {"hidden": [8], "activation": "tanh", "output": "tanh", "bias": True, "memory": None, **kind}
-    spec = policy_of({f"policy.{name}": value for name, value in values.items()}, 4, 3)
+    spec = policy_spec_of({f"policy.{name}": value for name, value in values.items()}, 4, 3)
     parameters_D, mean_O = (rng.normal(size=size).astype(np.float32) for size in (spec.parameters, 4))
     policy = Policy(spec, parameters_D, mean_O, np.float32([0.5, 1.0, 2.0, 3.0]), clip)
     session = onnxruntime.InferenceSession(onnx_model(policy, {"task": "t"}).SerializeToString())

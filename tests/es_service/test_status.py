@@ -21,7 +21,7 @@ from es_service.cli.main import app
 from es_service.cli.show import print_overview
 from es_service.cli.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
-from es_service.loop.interfaces import Stop
+from es_service.loop.state import Stop
 from es_service.report.data import read_run
 from es_service.report.summary import what_was_run
 from es_service.runs import run_status

@@ -8,7 +8,7 @@ import pytest
 from es_service import api
 from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, PlainStep
 from es_service.errors import StoreError
-from es_service.runs.snapshot import policy_spec, sound_nodes
+from es_service.runs.snapshot import sound_nodes, stored_policy_spec
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.steps import STEPS, restarted
 from tests.es_service.store_examples import CONSTANTS, meta
@@ -94,7 +94,7 @@ def test_every_method_with_a_gradient_takes_every_part(algorithm, tmp_path):
 @pytest.mark.parametrize("kind", STEPS)
 def test_a_stored_centre_has_the_arrays_of_its_step(tmp_path, kind):
     run = meta(constants=CONSTANTS | {"search.step.kind": kind})
-    size = policy_spec(run).parameters
+    size = stored_policy_spec(run).parameters
     arrays, node = STEPS[kind].fresh(size), "centres/0/step"
     sound_nodes(tmp_path, run, {node: {**arrays, "of_user_D": np.zeros(size, np.float32)}}, [node])
     for name, values in arrays.items():

@@ -23,7 +23,7 @@ from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.report.write import python_call
 from es_service.runs import certification
-from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, outputs_of
+from es_service.runs.certification import OTHER_PROGRAMS, certified_outputs, certify, certify_run
 from es_service.runs.certified import certified_policies
 from es_service.runs.evaluation import FRESH_GENERATION
 from es_service.runs.export import arrays
@@ -66,7 +66,7 @@ def episodes_of(config, policy, episodes, number, ask, domain) -> EpisodesResult
     from es_service.config.workload import worker_spec
 
     task = task_of(config)
-    direct = DirectEvaluator(worker_spec(config, task, outputs_of(task)))
+    direct = DirectEvaluator(worker_spec(config, task, certified_outputs(task)))
     parameters_D, mean_O, std_O = (x[None] for x in policy)
     asked = policy_work(
         parameters_D, (mean_O, std_O), episodes, seed=config.seed, generation=number, ask=ask, domain=domain

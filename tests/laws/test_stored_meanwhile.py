@@ -10,8 +10,7 @@ from es_service.loop import driver
 from es_service.loop.budget import Clock
 from es_service.loop.contents import StatePolicies
 from es_service.loop.generation import initial_state
-from es_service.loop.interfaces import Stop
-from es_service.loop.state import no_observations
+from es_service.loop.state import Stop, no_observations
 from es_service.protocol.episodes import completed
 from es_service.protocol.messages import EvaluationChunk
 from es_service.search.algorithms import ALGORITHMS
