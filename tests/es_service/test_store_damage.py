@@ -533,12 +533,12 @@ def test_platforms_that_an_older_version_recorded_or_replaced_are_read(tmp_path,
 
     create(folder).close()
     with monkeypatch.context() as older:
-        older.setattr(store, "store_list", lambda execute: None)
+        older.setattr(store, "store_platform_list", lambda execute: None)
         work(0, "a", 1)
     work(2, "a", 2)
     work(3, "b", 2)  # killed before it has finished a generation
     with monkeypatch.context() as older:
-        older.setattr(store, "store_list", lambda execute: None)
+        older.setattr(store, "store_platform_list", lambda execute: None)
         work(3, "a", 4)
         work(5, "c", 5)
     work(6, "d", 6)
