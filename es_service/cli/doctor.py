@@ -266,9 +266,9 @@ def step_findings(task: TaskSpec, cost: Mapping[str, Any]) -> Iterator[Finding]:
 
 def _what(task: TaskSpec) -> str:
     if task.parameters is not None:
-        return f"{task.name}: {task.summary or 'a function'}; parameters {', '.join(task.parameters.names)}"
-    actions = "actions to choose from" if task.discrete_actions else "numbers in an action"
+        return f"{task.name}: {task.summary.rstrip('.') or 'a function'}; parameters {', '.join(task.parameters.names)}"
+    unit, use = ("action", "to choose from") if task.discrete_actions else ("number", "in an action")
     return (
-        f"{task.name}: {task.summary or 'a task'}; {task.observation_size} numbers in an observation, "
-        f"{task.action_size} {actions}, {counted(task.episode_steps, 'step')}"
+        f"{task.name}: {task.summary.rstrip('.') or 'a task'}; {counted(task.observation_size, 'number')} in an "
+        f"observation, {counted(task.action_size, unit)} {use}, {counted(task.episode_steps, 'step')}"
     )
