@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,11 @@ from es_service.protocol.user_code import RaisedError, raised
 from workers import progress
 from workers.environments import make_function_task
 from workers.environments.function_task import FunctionTask
-from workers.host.episodes import Watched
 from workers.reports import Tail
 from workers.rollouts.backend import Episodes, FailedEpisode
+
+if TYPE_CHECKING:  # it imports the rollouts, which import this module
+    from workers.host.episodes import Watched
 
 PRINTED_BYTES = 500
 """At most this many bytes of what a call has printed are told if it ends its process, or takes too long."""

@@ -15,8 +15,8 @@ from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import progress
 from workers.compiling import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
-from workers.host.episodes import EnvironmentPool, Watched, known_from_the_start, run_episodes
-from workers.host.functions import Caller, run_calls
+from workers.host import episodes as host_episodes  # modules, which import `rollouts.backend` in turn
+from workers.host import functions as host_functions
 from workers.policies.policy import gradient_summer, members
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
@@ -76,7 +76,7 @@ class Host(RolloutBackend):
     ) -> Callable[[int], int]:
         """Steps of each environment of the batch in turn; one that ends is reset."""
         made = make_host_task(task.name, options)
-        lanes = [environment for _, environment in EnvironmentPool(made).of(range(batch))]
+        lanes = [environment for _, environment in host_episodes.EnvironmentPool(made).of(range(batch))]
         coordinates_A = np.arange(task.action_size, dtype=np.uint32)
         reset_keys_L_4 = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
         for lane in range(batch):
@@ -102,13 +102,13 @@ def make_runner(spec: WorkerSpec) -> tuple[Callable[..., Episodes], Callable[[It
         given = spec.environment, spec.environment_options
         (function,) = [make_function_task(*given) for _ in progress.counted("making", given[:1])]
         if spec.time_limit_s is None:
-            return partial(run_calls, function, function, spec), lambda lanes: None
-        caller = Caller(*given, spec.time_limit_s)
-        return partial(run_calls, function, caller, spec), lambda lanes: caller.start()
+            return partial(host_functions.run_calls, function, function, spec), lambda lanes: None
+        caller = host_functions.Caller(*given, spec.time_limit_s)
+        return partial(host_functions.run_calls, function, caller, spec), lambda lanes: caller.start()
     described = spec.environment, spec.environment_options, spec.choices, spec.descriptor_size
     (task,) = [make_host_task(*described) for _ in progress.counted("making", described[:1])]
-    lanes = EnvironmentPool(task)
-    return partial(run_episodes, lanes, spec), lanes.of
+    lanes = host_episodes.EnvironmentPool(task)
+    return partial(host_episodes.run_episodes, lanes, spec), lanes.of
 
 
 def _by_episode(keys_P_S_E_4: np.ndarray) -> np.ndarray:
@@ -135,7 +135,7 @@ def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recordin
     centre, slot = request.centre, request.slot
     count = EVALUATION_EPISODES_PER_CHUNK if request.policy is None else POLICY_SLOTS
     key = request.reset_key
-    watched = Watched(slot, [], [])
+    watched = host_episodes.Watched(slot, [], [])
     episodes = run(
         _in_lanes(centre.parameters_D, count),
         centre.observation_mean_O,
@@ -146,7 +146,7 @@ def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recordin
         keyed=request.domain == Domain.OTHER_TASK_RESET,
     )
     descriptor_T_B = np.stack(watched.descriptors)
-    known_from_the_start(descriptor_T_B)
+    host_episodes.known_from_the_start(descriptor_T_B)
     return Recording(
         descriptor_T_B=descriptor_T_B,
         returns_T=np.array(watched.returns, np.float32),
