@@ -14,9 +14,8 @@ import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import closing, contextmanager, nullcontext, suppress
-from dataclasses import replace
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.sent import LackingError, Received
@@ -26,17 +25,15 @@ from es_service.protocol.wire import framed, receive
 from workers import progress
 from workers.compiling import xla_cache_settings
 from workers.progress import Seen
-from workers.reports import Reports, require_room
+from workers.reports import Reports, reports_of, require_room
 from workers.rollouts import BACKENDS, platform_of_gpu
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here
-    from workers.compiling import Compilable
     from workers.rollouts.backend import ChunkFunctions
+    from workers.worker import Made
 
 REPORT_S = 0.5
 """Seconds between two looks at how far a worker is. Nothing is sent of work that is done sooner."""
-MOST_KNOWN = 4
-"""For the constants of so many runs, a process that stays has compiled functions at most."""
 
 
 def main(descriptor: int) -> None:
@@ -66,14 +63,6 @@ def main(descriptor: int) -> None:
     os._exit(0)
 
 
-class Made(NamedTuple):
-    """What computes the chunks of a run."""
-
-    run_chunks: Compilable
-    compiled: set[str]
-    """Kinds of chunks for which this process has compiled."""
-
-
 def _accept(control: socket.socket, runs: SimpleQueue[tuple[Future[Made | RaisedError], WorkerSpec]]) -> None:
     """Serve a worker for each socket that comes, until the parent closes its end; this ends the process."""
     try:
@@ -81,8 +70,7 @@ def _accept(control: socket.socket, runs: SimpleQueue[tuple[Future[Made | Raised
         while (given := _next(control)) is not None:
             if not isinstance(given, int):
                 runs.put(run := (Future(), given))
-                # One for all threads, which print and leak together; what was computed before has leaked, too.
-                reports = Reports(given, episodes=0 if reports is None else reports.episodes)
+                reports = reports_of(given, before=reports)  # one for all threads, which print and leak together
             elif run is not None:
                 threading.Thread(target=_work, args=(given, *run, reports), daemon=True).start()
     except Exception:
@@ -118,15 +106,12 @@ def _made(spec: WorkerSpec, before: dict[str, tuple[ChunkFunctions, set[str]]]) 
         return RaisedError(problem, "")
     os.environ.update(xla_cache_settings())
     try:
-        from workers.worker import make_worker
+        from workers.worker import compiled_before
 
-        of_any_seed = replace(spec, seed=0)
-        known = before.pop(repr(of_any_seed), None) or (BACKENDS[spec.rollout].chunk_functions(of_any_seed), set())
-        before[repr(of_any_seed)] = known  # the newest is last
-        for old in list(before)[:-MOST_KNOWN]:
-            del before[old]
-        made = Made(make_worker(spec, known[0]), known[1])
-        require_room(spec)
+        is_new = not before  # else what it has besides is of earlier runs, and it is replaced after its first work item
+        made = compiled_before(before, spec)
+        if is_new:
+            require_room(spec)
         return made
     except BaseException as error:  # also sys.exit in an environment
         return raised(error, *spec.task_code)
@@ -165,10 +150,8 @@ def _serve(parent: socket.socket, made: Future[Made | RaisedError], spec: Worker
                         with progress_of_item():
                             work = received.work(origins, pickled)
                             if (kind := type(work[0][1]).__name__) not in compiled:
-                                known = kind in ready.compiled
-                                seconds = 0.0 if known else ready.run_chunks.seconds_to_compile(work)
+                                seconds = ready.seconds_to_compile(work)
                                 compiled.add(kind)
-                                ready.compiled.add(kind)
                                 said.say("compiled", kind, seconds)
                             answer = ("results", item, attempt, results := ready.run_chunks(work))
                             reports.note(results)

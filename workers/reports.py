@@ -93,6 +93,12 @@ class Reports:
         self._most_bytes, self._cores = _limit(spec, cores), cores
         self._turn, self.episodes, self._looked_s, self._is_told = threading.Lock(), episodes, time.monotonic(), False
 
+    def close(self) -> None:
+        """Report nothing any more that was printed."""
+        with self._turn:
+            for tail in self._tails:
+                tail.close()
+
     def note(self, results: Iterable[ChunkResult]) -> None:
         of_member = self._of_member  # a training chunk, which alone has moments, counts members
         episodes = sum(
@@ -122,6 +128,14 @@ class Reports:
                 of = "" if self._cores == 1 else f" on {self._cores} cores"
                 return f"it has {has / 2**20:,.0f} MiB of memory{of} after {after} (compute.worker_memory_mb)"
         return ""
+
+
+def reports_of(spec: WorkerSpec, cores: int = 1, before: Reports | None = None) -> Reports:
+    """The reports of a worker for a run: what is printed from now on; and what its process has computed for the run
+    before counts, too, since it has leaked."""
+    if before is not None:
+        before.close()
+    return Reports(spec, cores, 0 if before is None else before.episodes)
 
 
 def require_room(spec: WorkerSpec, cores: int = 1) -> None:

@@ -6,6 +6,7 @@ A worker has no state that a restart would lose: every result is a pure function
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
@@ -48,6 +49,46 @@ from workers.rollouts.backend import (
 )
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
+Thing = TypeVar("Thing")
+MOST_KNOWN = 4
+"""For the constants of so many runs, a process that stays has compiled functions at most."""
+
+
+class Made(NamedTuple):
+    """What computes the chunks of a run."""
+
+    run_chunks: Compilable
+    compiled: set[str]
+    """Kinds of chunks for which this process has compiled, for this run or for earlier ones with the same constants."""
+
+    def seconds_to_compile(self, work: Sequence[Work]) -> float:
+        """Compile for the kind of some chunks, and say how long it took; 0 if that was done before."""
+        kind = type(work[0][1]).__name__
+        seconds = 0.0 if kind in self.compiled else self.run_chunks.seconds_to_compile(work)
+        self.compiled.add(kind)
+        return seconds
+
+
+def made_before(before: dict[str, Thing], spec: WorkerSpec, make: Callable[[WorkerSpec], Thing]) -> Thing:
+    """What was made for the constants of a run, whatever its seed, or is made for them now.
+
+    Args:
+        before: what was made for the constants of the last MOST_KNOWN runs, the newest last; it is changed.
+    """
+    of_any_seed = replace(spec, seed=0)
+    name = repr(of_any_seed)
+    before[name] = before.pop(name) if name in before else make(of_any_seed)
+    for old in list(before)[:-MOST_KNOWN]:
+        del before[old]
+    return before[name]
+
+
+def compiled_before(before: dict[str, tuple[ChunkFunctions, set[str]]], spec: WorkerSpec) -> Made:
+    """What computes the chunks of a run on one core; `before`: functions and what they were compiled for, as above."""
+    functions, compiled = made_before(
+        before, spec, lambda of_any_seed: (BACKENDS[spec.rollout].chunk_functions(of_any_seed), set())
+    )
+    return Made(make_worker(spec, functions), compiled)
 
 
 class Kind(NamedTuple):

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import (
@@ -31,10 +31,10 @@ from es_service.dispatch.events import (
     no_log,
     with_last_words,
 )
-from es_service.dispatch.staying import staying
+from es_service.dispatch.staying import staying, use_of
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.content import Cache
-from es_service.protocol.machine import cpu_seconds, places
+from es_service.protocol.machine import places
 from es_service.protocol.messages import FloatArray, Report, Work, WorkerSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.sent import LACKS_AGAIN, SENDER_BYTES, Memory, parcel
@@ -103,13 +103,16 @@ class ChildProcesses:
         on_report: Callable[[str, Report], None] = lambda worker, report: None,
     ) -> None:
         self._spec, self._threads = framed(spec), threads
-        same = repr(replace(spec, seed=0)) if alone else (spec.rollout, spec.output_bytes, *spec.sources.items())
-        self._use: Hashable = same
+        self._use = use_of(spec, alone=alone)
         self._gpus, self._places = gpus, places(os.environ, gpus) if gpus else ()
         self._on_report = on_report
         self._platforms: set[str] = set()
         self._parent_cache_bytes, self._output_bytes = spec.parent_cache_bytes, spec.output_bytes
         self._workers: dict[int, _Worker] = {}
+        self._begun_s: dict[Child, float] = {}
+        """Seconds of processors that a child had used when it began to work for this run."""
+        self._ended_s = 0.0
+        """Seconds of those that no longer do, for this run."""
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
@@ -121,8 +124,8 @@ class ChildProcesses:
         return {number: worker.child.pid for number, worker in self._workers.items()}
 
     def cpu_s(self) -> float:
-        """Seconds of the processors of this process and of all its children, with those that wait for the next run."""
-        return cpu_seconds({*self.process_ids().values(), *staying().process_ids()})
+        """Seconds of the processors of this process, and of all children for this run."""
+        return time.process_time() + self._ended_s + sum(child.cpu_s - begun for child, begun in self._begun_s.items())
 
     def start(self, worker: int) -> None:
         """Start a child and send it the constants of the run; or have the existing child start another thread."""
@@ -205,6 +208,8 @@ class ChildProcesses:
             self._forget(number)
         for child in busy:
             child.end()
+        for child in [*self._begun_s]:
+            self._count(child)
         for child, use in idle.items():
             staying().give(use, child)
 
@@ -217,7 +222,11 @@ class ChildProcesses:
         """A process that has been sent the constants of the run, one that has stayed or a new one; and its use."""
         environment = child_environment(self._gpus, place)
         use = self._use, os.getcwd(), *sorted(environment.items())
-        child = staying().take(use) or Child("workers.process", environment, self._output_bytes)
+        if (child := staying().take(use)) is None:
+            child, begun_s = Child("workers.process", environment, self._output_bytes), 0.0
+        else:
+            child.forget_output()
+            begun_s = child.cpu_s
         try:
             child.socket.setblocking(True)
             child.socket.sendall(b"s" + self._spec)
@@ -225,7 +234,13 @@ class ChildProcesses:
         except BaseException:
             child.end()
             raise
+        self._begun_s[child] = begun_s
         return use, child
+
+    def _count(self, child: Child) -> None:
+        """Remember the processors' time of a child that no longer works for this run."""
+        if (begun_s := self._begun_s.pop(child, None)) is not None:
+            self._ended_s += child.cpu_s - begun_s
 
     def _framed(self, name: bytes, array: FloatArray) -> bytes:
         """The message with an array, which is made once for all workers."""
@@ -314,6 +329,7 @@ class ChildProcesses:
             self._hear(number)
             self._forget(number)
         end = child.end()
+        self._count(child)
         if not reason:
             reason = f"worker {', '.join(map(str, lost))} (pid {child.pid}) ended with {end}"
         elif not charge_items:

@@ -1,54 +1,67 @@
-"""Workers that stay: processes of workers that wait for the next run of this program."""
+"""Workers that stay: what waits for the next run of this program."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from threading import Lock
+from typing import Any, Protocol
 
-from es_service.protocol.child import Child
 from es_service.protocol.machine import cores
+from es_service.protocol.messages import WorkerSpec
 
 IDLE_PER_CORE = 2
 """Most processes that wait, for each core: those of two kinds of runs that take turns."""
 
 
+class CanWait(Protocol):
+    """What can wait, such as the process of a worker."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it is still there."""
+        ...
+
+    def kill(self) -> None:
+        """Begin to end it."""
+        ...
+
+    def end(self) -> object:
+        """End it, and wait for that."""
+        ...
+
+
 class Staying:
-    """The processes of this program that wait."""
+    """What waits in this program."""
 
     def __init__(self) -> None:
-        self._idle: list[tuple[Hashable, Child]] = []
-        """What a process can be used for, and the process; the one that has waited longest is first."""
+        self._idle: list[tuple[Hashable, CanWait]] = []
+        """What something can be used for, and the thing; the one that has waited longest is first."""
         self._blocks, self._turn, self._maker = 0, Lock(), os.getpid()
 
-    def take(self, use: Hashable) -> Child | None:
-        """A process that waits and can be used for this, the newest; None if there is none."""
+    def take(self, use: Hashable) -> Any | None:
+        """What waits and can be used for this, the newest of it; None if there is nothing."""
         with self._turn:
             fitting = [entry for entry in self._idle if entry[0] == use]
             self._idle = [entry for entry in self._idle if entry[0] != use]
             while fitting:
-                _, child = fitting.pop()
-                if child.is_running:
+                _, waiting = fitting.pop()
+                if waiting.is_running:
                     self._idle += fitting
-                    child.forget_output()
-                    return child
-                child.end()
+                    return waiting
+                waiting.end()
         return None
 
-    def give(self, use: Hashable, child: Child) -> None:
-        """Let a process that has nothing left to do wait, inside a block of `workers`; elsewhere end it."""
+    def give(self, use: Hashable, waiting: CanWait) -> None:
+        """Let something that has nothing left to do wait, inside a block of `workers`; elsewhere end it."""
         with self._turn:
-            self._idle += [(use, child)]
+            self._idle += [(use, waiting)]
             most = IDLE_PER_CORE * cores() if self._blocks else 0
             ended = [self._idle.pop(0) for _ in range(len(self._idle) - most)]
         _end(ended)
-
-    def process_ids(self) -> list[int]:
-        """Ids of those that wait."""
-        with self._turn:
-            return [child.pid for _, child in self._idle]
 
     def enter(self) -> None:
         """A block of `workers` begins."""
@@ -56,7 +69,7 @@ class Staying:
             self._blocks += 1
 
     def leave(self) -> None:
-        """A block ends, and with the last one the processes. Those of a process that was forked are the other one's."""
+        """A block ends, and with the last one what waits. That of a process that was forked is the other one's."""
         if os.getpid() != self._maker:
             return
         with self._turn:
@@ -65,21 +78,30 @@ class Staying:
         _end(ended)
 
 
-def _end(entries: list[tuple[Hashable, Child]]) -> None:
-    for _, child in entries:
-        child.kill()  # all before waiting, since each takes some time to free its memory
-    for _, child in entries:
-        child.end()
+def _end(entries: list[tuple[Hashable, CanWait]]) -> None:
+    for _, waiting in entries:
+        waiting.kill()  # all before waiting for one, since each takes some time to free its memory
+    for _, waiting in entries:
+        waiting.end()
 
 
 def staying() -> Staying:
-    """The processes of this program that wait."""
+    """What waits in this program."""
     return _of(os.getpid())
 
 
 @cache
 def _of(process: int) -> Staying:
     return Staying()
+
+
+def use_of(spec: WorkerSpec, *, alone: bool) -> Hashable:
+    """What the process of a worker can be used for after a run: for others with the same rollout and code.
+
+    Args:
+        alone: whether only for runs with the same constants, whatever their seed.
+    """
+    return repr(replace(spec, seed=0)) if alone else (spec.rollout, spec.output_bytes, *spec.sources.items())
 
 
 @contextmanager

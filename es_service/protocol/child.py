@@ -31,6 +31,7 @@ from queue import SimpleQueue
 from typing import IO, Any, NamedTuple, Self
 
 from es_service.protocol.errors import ForkedError
+from es_service.protocol.machine import process_cpu_s
 from es_service.protocol.process_environment import child_environment, newest_output
 from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import BUFFER_BYTES, framed, receive
@@ -63,6 +64,8 @@ class End(NamedTuple):
     """Such as "signal SIGKILL" or "exit code 3"."""
     last_words: str
     """The last of what it printed; empty if it printed where this process does."""
+    cpu_s: float = 0.0
+    """Seconds of processors that it had used, see `process_cpu_s`."""
 
     def __str__(self) -> str:
         return f"{self.how}:\n{self.last_words}" if self.last_words else self.how
@@ -202,6 +205,11 @@ class Child:
         """Whether its process runs."""
         return not self.is_ended and self._process.poll() is None
 
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of processors that it has used so far, see `process_cpu_s`."""
+        return process_cpu_s(self.pid) if self._end is None else self._end.cpu_s
+
     def forget_output(self) -> None:
         """Begin anew with what it prints."""
         if self._log is not None:
@@ -272,6 +280,9 @@ def _end(
     if os.getpid() != maker:
         return None  # in a process that was forked from it
     _kill(process)
+    with suppress(ChildProcessError):  # it has been waited for already
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    cpu_s = process_cpu_s(process.pid)
     code = process.wait()
     guard.communicate()
     last_words = ""
@@ -280,7 +291,7 @@ def _end(
         with log:
             log.seek(max(0, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
             last_words = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
-    return End(f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}", last_words)
+    return End(f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}", last_words, cpu_s)
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

@@ -133,13 +133,18 @@ def _said(*command: str) -> str:
 
 def cpu_seconds(processes: Iterable[int]) -> float:
     """Seconds of processors of this process so far, of its children that have ended, and of some that are running."""
-    ended, tick = resource.getrusage(resource.RUSAGE_CHILDREN), os.sysconf("SC_CLK_TCK")
-    total = time.process_time() + ended.ru_utime + ended.ru_stime
-    for process in processes:
-        with suppress(OSError, ValueError, IndexError):  # it has just ended
-            fields_of = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-            total += (int(fields_of[11]) + int(fields_of[12])) / tick
-    return total
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + ended.ru_utime + ended.ru_stime + sum(map(process_cpu_s, processes))
+
+
+def process_cpu_s(process: int) -> float:
+    """Seconds of processors of a process so far, and of what it has started and waited for; 0 if it is gone, or where
+    only Linux says it."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError):
+        return 0.0
 
 
 VERSION = "0.28.0"

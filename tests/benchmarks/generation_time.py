@@ -3,12 +3,16 @@
     python -m tests.benchmarks.generation_time [--task point_maze] [--algorithm es] [--engine inline ray]
     python -m tests.benchmarks.generation_time --emitters 1 16      # ME-ES, 64 pairs for each emitter
     python -m tests.benchmarks.generation_time --driver             # the driver's own time, without rollouts
+    python -m tests.benchmarks.generation_time --study --task ant_trap        # a study of 6 runs of 12 generations
 
 Two workers; PointMaze with 64, 512 and 4,096 pairs, ants with 64 and 5,000; medians over the generations, but for the
 first ten if there are more; the engines take turns. Memory is that of this process and everything it started, shared
 pages divided among those who share them. With --emitters each run is followed by a measurement of what rollouts alone
 make on the same cores (`es-service bench rollouts`), and its rate is also given as a share of that. With --driver,
 episodes have five steps, so that the workers do little; what counts is the processor time of the driver's process.
+With --study, two workers compute a study of Optuna's whose trials are tiny: each trial with workers of its own, and
+then all of them in one block of `es_service.workers()`. A run before both is not counted, so that compiled code is on
+disk for both.
 """
 
 from __future__ import annotations
@@ -19,9 +23,10 @@ import json
 import os
 import tempfile
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
-from es_service import api
+from es_service import api, workers
 from es_service.cli.bench import bench_rollouts
 
 POINT_MAZE_SIZES = ((64, 500), (512, 150), (4096, 40))
@@ -131,6 +136,30 @@ def driver_ms(algorithm: str, settings: dict[str, int], folder: Path) -> float:
     return round((at[LAST] - at[FIRST]) * 1000 / (LAST - FIRST), 2)
 
 
+def study(task: str, engine: str, trials: int, folder: Path, *, stay: bool) -> tuple[float, list[str]]:
+    """Seconds of a study of Optuna's, and the digests of its runs."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    digests = []
+
+    def value(trial: optuna.Trial) -> float:
+        config = {
+            "task": {"environment": task, "episode_steps": 10},
+            "search": {"algorithm": "es", "pairs": 4, "sigma": trial.suggest_float("sigma", 0.01, 0.5, log=True)},
+            "budget": {"generations": 12},
+            "compute": {"workers": 2, "engine": engine},
+        }
+        run = api.run(config, folder / str(trial.number)).run
+        digests.append(run.digest())
+        return float(run.history["centre_fitness_mean"].iloc[-1])
+
+    started = time.perf_counter()
+    with workers() if stay else nullcontext():
+        optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0)).optimize(value, n_trials=trials)
+    return time.perf_counter() - started, digests
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", default="point_maze")
@@ -138,11 +167,21 @@ def main() -> None:
     parser.add_argument("--engine", nargs="+", default=["inline", "ray"])
     parser.add_argument("--emitters", nargs="*", type=int, default=[])
     parser.add_argument("--driver", action="store_true")
+    parser.add_argument("--study", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         for name, case in DRIVER.items() if arguments.driver else ():
             print(json.dumps({"case": name, "driver_ms": driver_ms(*case, Path(folder) / name)}), flush=True)
         if arguments.driver:
+            return
+        for engine in arguments.engine if arguments.study else ():
+            here = Path(folder) / engine
+            study(arguments.task, engine, 1, here / "before", stay=False)
+            alone_s, digests = study(arguments.task, engine, 6, here / "alone", stay=False)
+            stay_s, same = study(arguments.task, engine, 6, here / "stay", stay=True)
+            row = {"alone_s": round(alone_s, 1), "stay_s": round(stay_s, 1), "ratio": round(stay_s / alone_s, 3)}
+            print(json.dumps({"study": arguments.task, "engine": engine, **row, "same": digests == same}), flush=True)
+        if arguments.study:
             return
         sizes = POINT_MAZE_SIZES if arguments.task == "point_maze" else ANT_SIZES
         for emitters, engine in itertools.product(arguments.emitters, arguments.engine):

@@ -172,6 +172,7 @@ def test_results_are_told_once_and_only_of_what_is_asked_now(tmp_path):
 
     def told_by(search):
         asked = search.ask()
+        assert len(repr(asked)) < 200, "it is printed on one line, without its parameters"
         search.tell(asked, *told_of(asked))
         told.append(asked)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import re
 import signal
@@ -10,7 +9,6 @@ import socket
 import threading
 import time
 from contextlib import ExitStack
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,6 @@ from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
 from es_service.dispatch.events import Limits, Placed, Progress, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.staying import staying
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
@@ -219,15 +216,6 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
     assert isinstance(second, WorkerLost)
     assert re.search(reason, first.reason)
     assert transport.process_ids() == {}
-
-
-def test_seconds_of_processors_count_processes_that_wait_so_that_whoever_takes_one_over_begins_with_none(transport):
-    transport, before_s = transport[0], transport[0].cpu_s()
-    staying()._idle.append(("use", SimpleNamespace(pid=os.getpid())))
-    try:
-        assert transport.cpu_s() - before_s > 0.9 * time.process_time()
-    finally:
-        staying()._idle.pop()
 
 
 def test_what_a_process_wrote_before_it_was_killed_is_told_of_all_its_workers(transport):

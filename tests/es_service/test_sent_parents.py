@@ -36,6 +36,7 @@ from workers import process
 from workers.actor import WorkerActor
 from workers.compiling import Compilable
 from workers.reports import Reports
+from workers.worker import Made
 
 PARENTS, WORKERS = 60, 2
 FAILING = 9
@@ -90,7 +91,7 @@ class Threads(inline_module.ChildProcesses):
         child = Child("tests.es_service.shell_child:shell", child_environment())
         ours, theirs = socket_pair()
         computing: Future[Any] = Future()
-        computing.set_result(process.Made(COMPUTING, set()))
+        computing.set_result(Made(COMPUTING, set()))
         given = theirs.detach(), computing, self.theirs, Reports(self.theirs)
         threading.Thread(target=process._work, args=given, daemon=True).start()
         self._add(worker, child, ours)

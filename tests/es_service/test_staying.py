@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,36 @@ def test_what_computes_when_a_run_ends_does_not_stay(tmp_path, started):
             run(function(budget={"generations": 50}), tmp_path / "two", on_generation=end)
         assert len(staying()._idle) == sum(is_running(child.pid) for child in started) <= 1
         run(FUNCTION, tmp_path / "three")
+
+
+@pytest.mark.slow
+def test_seconds_of_processors_are_those_for_a_run_also_while_the_processes_of_others_wait(tmp_path, started):
+    with workers():
+        with es_service.evaluator(FUNCTION) as evaluate:
+            transport = evaluate._engine.transport
+            before_s = transport.cpu_s() - time.process_time() - started[0].cpu_s
+            run(FUNCTION, tmp_path / "one")
+            run(FUNCTION, tmp_path / "two")
+            run(FUNCTION | {"seed": 3}, tmp_path / "three")
+            _, other = started
+            assert other.is_running
+            assert other.cpu_s > 0.2, "it has started Python"
+            assert transport.cpu_s() - time.process_time() - started[0].cpu_s == pytest.approx(before_s, abs=0.1)
+        begun_s, driver_s = other.cpu_s + started[0].cpu_s, time.process_time()
+        again = run(FUNCTION, tmp_path / "four")
+        used_s = time.process_time() - driver_s + other.cpu_s + started[0].cpu_s - begun_s
+        assert again.history["cpu_s"].iloc[-1] <= used_s + 0.05
+    assert len(started) == 2
+
+
+def test_a_process_that_has_ended_says_how_long_it_computed():
+    child = Child("tests.es_service.shell_child:shell", child_environment())
+    busy = "i=0; while [ $i -lt 400000 ]; do i=$((i+1)); done"
+    child.call("shell")
+    child.call(busy)
+    before_s = child.cpu_s
+    assert before_s > 0.2, "with what it has started"
+    assert child.end().cpu_s == child.cpu_s == pytest.approx(before_s, abs=0.1)
 
 
 def test_blocks_can_be_nested_and_overlap_in_threads(tmp_path, started):
