@@ -71,6 +71,14 @@ def report(
         list[str] | None,
         typer.Option("--metric", metavar="NAME", help="Column of --figures and --statistics; can be repeated."),
     ] = None,
+    against: Annotated[
+        str,
+        typer.Option(
+            "--against",
+            metavar="COLUMN",
+            help="Axis of the curves of --figures: env_steps, generation, wall_clock_s, rollout_s or cpu_s.",
+        ),
+    ] = "env_steps",
     statistics: Annotated[
         Path | None,
         typer.Option(
@@ -89,13 +97,13 @@ def report(
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")
         if out is None and len(folders) > 1:
             raise ConfigError("a comparison of runs belongs to none of their folders; add --out FILE")
-        how = _How(
-            group_by or (), threshold, figures, paired, statistics, bounds_of(bounds or ()), label or (), metric or ()
-        )
+        drawn = figures, metric or (), against
+        how = _How(group_by or (), threshold, paired, statistics, bounds_of(bounds or ()), label or (), *drawn)
         _compare(folders, out or folders[0] / REPORT, how)
         return
-    if group_by or threshold is not None or paired or statistics:
-        print_note("note: --group-by, --threshold, --paired and --statistics have no effect with one run")
+    if group_by or threshold is not None or paired or statistics or bounds or label:
+        of_several = "--group-by, --threshold, --paired, --bounds, --label and --statistics"
+        print_note(f"note: {of_several} have no effect with one run")
     [folder] = folders
     wanted = list(dict.fromkeys(replay or ["best"]))
     if "none" in wanted and len(wanted) > 1:
@@ -111,6 +119,8 @@ def report(
         trusted=replay is not None,
         evaluate=evaluation_of(folder),
         figures=figures,
+        metrics=metric or (),
+        against=against,
     ):
         print(file)
 
@@ -118,12 +128,13 @@ def report(
 class _How(NamedTuple):
     group_by: Sequence[str]
     threshold: float | None
-    figures: Path | None
     paired: bool
     statistics: Path | None
     bounds: dict[str, tuple[float, float]]
     labels: Sequence[str]
+    figures: Path | None
     metrics: Sequence[str]
+    against: str
 
 
 def _compare(folders: Sequence[Path], out: Path, how: _How) -> None:
@@ -145,8 +156,17 @@ def _compare(folders: Sequence[Path], out: Path, how: _How) -> None:
         group_by = swept_keys(runs)
     if how.labels:
         runs, group_by = labelled(runs, group_by, dict(_pair(word) for word in how.labels)), GROUP
-    given = runs, out, group_by, how.threshold, how.figures
-    for file in write_comparison(*given, paired=how.paired, statistics=how.statistics, metrics=how.metrics):
+    for file in write_comparison(
+        runs,
+        out,
+        group_by,
+        how.threshold,
+        how.figures,
+        paired=how.paired,
+        statistics=how.statistics,
+        metrics=how.metrics,
+        against=how.against,
+    ):
         print(file)
     if problems:
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -24,7 +25,7 @@ from es_service.report import statistics
 from es_service.report.compare import Group, runs_of
 from es_service.report.data import RunData
 from es_service.report.markup import Markup, table, tag
-from es_service.report.measures import Measure, chosen
+from es_service.report.measures import Measure, chosen, measure_named
 from es_service.report.page import section
 from es_service.report.statistics import Difference
 from es_service.report.summary import number
@@ -189,14 +190,15 @@ def section_of(groups: Sequence[Group], threshold: float | None, paired: bool = 
     parts: list[Markup] = []
     measures = compared(groups, threshold, paired=paired)
     for measure in measures:
+        title, scale = _title_and_scale(measure)
         averages = [
             (
                 average.group,
                 f"{average.runs}"
                 if average.reached == average.runs
                 else f"{average.reached} of {average.runs} reach it",
-                _with_ends(average.median, average.median_interval),
-                "-" if average.iqm is None else _with_ends(average.iqm, average.iqm_interval),
+                _with_ends(average.median, average.median_interval, scale),
+                "-" if average.iqm is None else _with_ends(average.iqm, average.iqm_interval, scale),
             )
             for average in measure.averages
         ]
@@ -204,14 +206,14 @@ def section_of(groups: Sequence[Group], threshold: float | None, paired: bool = 
             (
                 f"{pair.first} over {pair.second}",
                 _with_ends(pair.difference.improvement, pair.difference.interval),
-                "-" if np.isnan(pair.difference.shift) else number(pair.difference.shift),
+                "-" if np.isnan(pair.difference.shift) else number(scale * pair.difference.shift),
                 p_text(pair.difference.p),
                 p_text(pair.p_corrected),
             )
             for pair in measure.pairs
         ]
         parts += [
-            tag("h3", f"{measure.title}{' (less is better)' if measure.lower_is_better else ''}"),
+            tag("h3", f"{title}{' (less is better)' if measure.lower_is_better else ''}"),
             tag(
                 "div",
                 table(averages, ("group", "runs", "median", "interquartile mean"), "numbers"),
@@ -231,9 +233,24 @@ def p_text(p: float) -> str:
     return f"{p:.2g}" if p >= 0.0001 else "< 0.0001"
 
 
-def _with_ends(value: float, ends: Ends | None) -> Markup:
-    shown = "" if ends is None or np.isnan(ends[0]) or ends[0] == ends[1] else f"{_known(ends[0])} to {_known(ends[1])}"
-    return tag("div", _known(value), tag("div", shown, class_="note") if shown else None)
+def greatest_p(groups: Sequence[Group], column: str, first: str, *, paired: bool) -> float | None:
+    """The greatest corrected p of the pairs of a measure in which a group is; None if there are no two groups of two
+    runs or more."""
+    if len(groups) < 2 or min(len(group.runs) for group in groups) < 2:
+        return None
+    [measure] = compared(groups, paired=paired, metrics=[column])
+    return max(pair.p_corrected for pair in measure.pairs if first in (pair.first, pair.second))
+
+
+def _title_and_scale(measure: Compared) -> tuple[str, float]:
+    """Title of a measure and the factor of its numbers, since shares are shown as percentages."""
+    return (f"{measure.title} (%)", 100.0) if measure_named(measure.name).percent else (measure.title, 1.0)
+
+
+def _with_ends(value: float, ends: Ends | None, scale: float = 1.0) -> Markup:
+    low, high = (np.nan, np.nan) if ends is None else ends
+    shown = "" if np.isnan(low) or low == high else f"{_known(scale * low)} to {_known(scale * high)}"
+    return tag("div", _known(scale * value), tag("div", shown, class_="note") if shown else None)
 
 
 def _known(value: float) -> str:
@@ -253,7 +270,8 @@ def _explained(groups: Sequence[Group], paired: bool) -> str:
         f"Ranges are {100 * LEVEL:.0f} % intervals by the percentile bootstrap over runs.",
         "In simulations, those of 3 runs hold the true value three times in four, and those of 5 nine times in ten.",
         "The interquartile mean leaves out a quarter of the runs at each end.",
-        "The probability of improvement is that of a run of the first group being better than one of the second.",
+        "The probability of improvement is an effect size: that of a run of the first group being better than one of "
+        "the second.",
         "The difference is the median of the differences between their runs.",
         f"p is two-sided, from {test}, and corrected by Holm's method for all pairs of groups.",
     ]
@@ -319,8 +337,9 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _latex(measures: Sequence[Compared]) -> str:
-    """A table (booktabs) with a row for each group and two columns for each measure."""
-    heads = [_escaped(measure.title) for measure in measures]
+    """A table (booktabs) with a row for each group and a column for each measure."""
+    titles, scales = zip(*map(_title_and_scale, measures), strict=True)
+    heads = map(_escaped, titles)
     lines = [
         rf"% median, and {100 * LEVEL:.0f} \% interval by the percentile bootstrap over runs",
         rf"\begin{{tabular}}{{lr{'r' * len(measures)}}}",
@@ -330,16 +349,17 @@ def _latex(measures: Sequence[Compared]) -> str:
     ]
     for rows in zip(*(measure.averages for measure in measures), strict=True):
         cells = []
-        for average in rows:
+        for average, scale in zip(rows, scales, strict=True):
             ends = average.median_interval
-            known = "" if ends is None else rf" [{_plain(ends[0])}, {_plain(ends[1])}]"
-            cells.append(f"{_plain(average.median)}{known}")
+            known = "" if ends is None else rf" [{_in_latex(scale * ends[0])}, {_in_latex(scale * ends[1])}]"
+            cells.append(f"{_in_latex(scale * average.median)}{known}")
         lines.append(" & ".join([_escaped(rows[0].group), str(rows[0].runs), *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _plain(value: float) -> str:
-    return number(value) if np.isfinite(value) else "--"
+def _in_latex(value: float) -> str:
+    """A number in text, whose sign is a minus and no hyphen."""
+    return re.sub(r"-[\d,.]+", r"$\g<0>$", _known(value))
 
 
 _ESCAPES = {sign: f"\\{sign}" for sign in "_%&#${}"} | {

@@ -64,7 +64,7 @@ def comparison_sections(
         figures.append(figure)
         points.append({"axes": axes, "texts": texts})
     task = ", ".join(groups[0].tasks)
-    said = tag("p", _sentence(groups, threshold), class_="verdict")
+    said = tag("p", _sentence(groups, threshold, paired=paired), class_="verdict")
     sections = {
         "what": tag("section", said, *_problems(runs), id="what"),
         "curves": section(
@@ -83,7 +83,7 @@ def comparison_sections(
     return f"{counted(len(runs), 'run')} on {task}", sections, {"charts": points}
 
 
-def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
+def _sentence(groups: Sequence[Group], threshold: float | None, *, paired: bool) -> str:
     summaries = compare.summaries(groups, threshold)
     column = compare.value_column(compare.runs_of(groups))
     what = VALUES[column]
@@ -99,6 +99,12 @@ def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
             f"Of {len(groups)} groups, {best.group.name} ends with the highest median of the {what}: {value} "
             f"({runs}{interval})"
         )
+        if (p := between.greatest_p(groups, column, best.group.name, paired=paired)) is not None:
+            others = [group.name for group in groups if group.name != best.group.name]
+            whose = f"p of its difference from {others[0]}"
+            if len(others) > 1:
+                whose = "the greatest corrected p of its differences from the others"
+            sentence += f"; {whose} is {between.p_text(p)}"
     if column == CERTIFIED:
         sentence += f"; the median of its selected best fitness is {number(best.values['best_fitness'].median)}"
     if threshold is not None:

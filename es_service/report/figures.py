@@ -24,15 +24,17 @@ GROUPS_IN_A_ROW = 6
 PANEL_SIZE = 1.7
 """Width of a panel in inches; its title is above it."""
 CURVES_HEIGHT = 2.4
-DOT_AREA = 2.5
-"""In square points."""
 FEWEST_COLUMNS = 4
 """So many panels wide is the figure at least, or the curves were too narrow."""
 CURVES = (CERTIFIED, "best_fitness", "coverage")
 
 
 def draw_overview(
-    runs: Sequence[RunData], figure: Any, keys: Sequence[str] = (), threshold: float | None = None
+    runs: Sequence[RunData],
+    figure: Any,
+    keys: Sequence[str] = (),
+    threshold: float | None = None,
+    against: str = "env_steps",
 ) -> None:
     """Draw all evaluated centres of each group, the runs of a group on top of each other, and under them the curves.
 
@@ -42,17 +44,18 @@ def draw_overview(
         figure: an empty figure of matplotlib, whose size is changed.
         keys: config keys that group the runs; see `compare.grouped`.
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
+        against: as in `plots.curves`.
     """
     threshold = compare.common_threshold(runs) if threshold is None else threshold
     summaries = compare.summaries(compare.grouped(runs, keys), threshold)
     columns = [column for column in CURVES if column in measures(runs) and has_curve(runs, column)]
-    wide = max(FEWEST_COLUMNS, min(GROUPS_IN_A_ROW, len(summaries)))
-    rows = -(-len(summaries) // wide)
-    figure.set_size_inches(wide * PANEL_SIZE, rows * (PANEL_SIZE + 0.5) + CURVES_HEIGHT)
+    across = min(GROUPS_IN_A_ROW, len(summaries))
+    rows = -(-len(summaries) // across)
+    figure.set_size_inches(max(FEWEST_COLUMNS, across) * PANEL_SIZE, rows * (PANEL_SIZE + 0.5) + CURVES_HEIGHT)
     figure.set_layout_engine("constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(rows * (PANEL_SIZE + 0.5), CURVES_HEIGHT))
     colours = value_range(np.concatenate([run.centres["fitness_mean"] for run in runs]))
-    panels, drawn = above.subplots(rows, wide, squeeze=False).ravel(), []
+    panels, drawn = above.subplots(rows, across, squeeze=False).ravel(), []
     for axes, summary in zip(panels, summaries, strict=False):
         count = len(summary.group.runs)
         solved = "" if threshold is None else f"{summary.solved} of {count} reach {threshold:g}"
@@ -61,17 +64,21 @@ def draw_overview(
         axes.set_title(f"{summary.group.name}\n{solved or counted(count, 'run')}", fontsize=9, parse_math=False)
     for axes in panels[len(summaries) :]:
         axes.set_axis_off()
+    most = max(sum(len(run.centres["fitness_mean"]) for run in summary.group.runs) for summary in summaries)
     for points in drawn:
-        points.set_sizes([DOT_AREA])
+        points.set_sizes([plots.dot_area(most)])
     above.colorbar(drawn[-1], ax=panels, label="fitness", aspect=30, fraction=0.02, pad=0.01)
     curves = below.subplots(1, len(columns), squeeze=False).ravel()
     for axes, column in zip(curves, columns, strict=True):
-        plots.curves(list(runs), axes, column, group_by=keys)
+        plots.curves(list(runs), axes, column, against, keys)
     if len(summaries) > 1:
         handles, labels = curves[0].get_legend_handles_labels()
+        title = curves[0].get_legend().get_title().get_text()
         for axes in curves:
             axes.get_legend().remove()
-        legend = below.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+        legend = below.legend(
+            handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, title=title
+        )
         for text in legend.get_texts():
             text.set_parse_math(False)
 
@@ -85,7 +92,14 @@ SIZE = (COLUMN, 2.6)
 PANELS_IN_A_ROW, SMALL_PANELS_IN_A_ROW = 4, 7
 FEW = 8
 """With more groups, their maps are small."""
-STYLE = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7, "lines.linewidth": 1.2, "pdf.fonttype": 42}
+STYLE = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7,
+    "legend.title_fontsize": 7,
+    "lines.linewidth": 1.2,
+    "pdf.fonttype": 42,
+}
 """Sizes of text as in a paper; text in a PDF stays text."""
 
 
@@ -105,6 +119,7 @@ def write_figures(
     keys: Sequence[str] = (),
     threshold: float | None = None,
     metrics: Sequence[str] = (),
+    against: str = "env_steps",
 ) -> list[Path]:
     """Write all figures of one run, or of the comparison of several; return the files.
 
@@ -113,6 +128,7 @@ def write_figures(
         threshold: fitness from which a run of a comparison counts as solved; see `draw_overview`.
         metrics: columns of which curves and profiles are drawn; none: curves of all of `measures`, and a profile of the
             value by which runs are judged.
+        against: axis of the curves; see `plots.curves`.
 
     Raises:
         ConfigError: matplotlib is missing, the runs cannot be compared, or one lacks a metric. StoreError: the folder
@@ -122,7 +138,7 @@ def write_figures(
     for column in chosen(runs, metrics):
         if has_curve(runs, column):
             drawings[column] = lambda figure, column=column: plots.curves(
-                list(runs), figure.subplots(), column, group_by=keys
+                list(runs), figure.subplots(), column, against, keys
             )
     mapped = [run for run in runs if run.map is not None and run.map.size and len(run.names) <= 2]
     if mapped:
@@ -136,7 +152,7 @@ def write_figures(
         drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
     else:
         if len({run.constants["task.environment"] for run in runs}) == 1:
-            drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
+            drawings["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold, against)
         for column in metrics or [compare.value_column(runs)]:
             drawings[f"profile_{column}" if metrics else "profile"] = lambda figure, column=column: plots.profile(
                 list(runs), figure.subplots(), column, keys

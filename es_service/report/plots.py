@@ -23,7 +23,8 @@ from es_service.report.data import RunData, read_run
 from es_service.report.floor import beside_walls, detours, is_plan
 from es_service.report.markup import tick_text, value_range
 from es_service.report.measures import measure_named
-from es_service.report.series import X_AXES, lone
+from es_service.report.series import X_AXES, axes_of, lone
+from es_service.runs.selection import LEVEL
 from es_service.runs.view import Run
 from es_service.search.maps.geometry import Grid, intervals
 
@@ -35,6 +36,9 @@ Several = list[RunSource] | list[RunData] | tuple[RunSource, ...]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9", "#59626d")
 DASHES = ("-", "--", ":", "-.", (0, (3, 1)), (0, (8, 2)), (0, (6, 2, 1, 2, 1, 2)))
 WALL, PATH = "#1d2126", "#d55e00"
+DOT_AREA = (2.5, 12.0)
+"""Least and greatest area of a dot in square points; all dots of a panel have DOTS_AREA, if that is between."""
+DOTS_AREA = 3000.0
 
 
 def behaviour_map(run: RunSource, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
@@ -109,8 +113,23 @@ def centres(run: RunSource, axes: Axes, colours: tuple[float, float] | None = No
         _plane(data, axes)
     low, high = colours or value_range(fitness)
     return axes.scatter(
-        x, y, c=fitness, cmap="viridis", vmin=low, vmax=high, s=4, linewidths=0, zorder=2, rasterized=True
+        x,
+        y,
+        c=fitness,
+        cmap="viridis",
+        vmin=low,
+        vmax=high,
+        s=dot_area(len(x)),
+        linewidths=0,
+        zorder=2,
+        clip_on=False,
+        rasterized=True,
     )
+
+
+def dot_area(count: int) -> float:
+    """Area in square points of each of so many dots: few ones are seen in print, and many do not cover each other."""
+    return float(np.clip(DOTS_AREA / max(count, 1), *DOT_AREA))
 
 
 def trajectory(run: RunSource, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
@@ -160,7 +179,7 @@ def curves(
     with one seed, or with several runs of the same seed, has none.
 
     Args:
-        against: `generation`, `env_steps` or `wall_clock_s`.
+        against: `generation`, `env_steps`, `wall_clock_s`, `rollout_s` or `cpu_s`.
         group_by: config keys that group the runs; see `compare.grouped`.
 
     Raises ConfigError for another column or axis, and for runs of different tasks, and NotInRunError for a run without
@@ -170,7 +189,8 @@ def curves(
     for data in all_data:
         if not data.history["generation"].size:
             raise NotInRunError(f"{data.folder} has no finished generation yet", run=data.folder)
-    for name, allowed in ((column, all_data[0].history), (against, X_AXES)):
+    places = [name for name in X_AXES if all(name in axes_of(data.history) for data in all_data)]
+    for name, allowed in ((column, all_data[0].history), (against, places)):
         if name not in allowed or any(column not in data.history for data in all_data):
             raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
     groups = compare.grouped(all_data, group_by)
@@ -187,7 +207,7 @@ def curves(
     axes.set(xlabel=X_AXES[against], ylabel=measure_named(column).label)
     if against == "env_steps":
         axes.xaxis.set_major_formatter(importlib.import_module("matplotlib.ticker").EngFormatter(sep=""))
-    _frame(axes, legend=len(groups) > 1)
+    _frame(axes, legend=len(groups) > 1, lines="median")
 
 
 def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: Sequence[str] = ()) -> None:
@@ -214,7 +234,7 @@ def profile(runs: Several, axes: Axes, measure: str = "best_fitness", group_by: 
             axes.fill_between(place_K, *ends_2_K, color=style["color"], alpha=0.18, linewidth=0, **steps)
     axes.set(ylim=(-0.02, 1.02), ylabel=f"share of runs at {'least' if sign > 0 else 'most'} here")
     axes.set_xlabel(title, parse_math=False)
-    _frame(axes, legend=True)
+    _frame(axes, legend=True, lines="share")
 
 
 def archive_profile(runs: RunSource | Several, axes: Axes, group_by: Sequence[str] = ()) -> None:
@@ -236,7 +256,7 @@ def archive_profile(runs: RunSource | Several, axes: Axes, group_by: Sequence[st
         if (interval_2_K := group.interval(share_R_K)) is not None:
             axes.fill_between(fitness_K, *interval_2_K, color=_style(index)["color"], alpha=0.18, linewidth=0)
     axes.set(ylim=(0, None), xlabel="fitness", ylabel="share of cells with at least this fitness")
-    _frame(axes, legend=len(groups) > 1)
+    _frame(axes, legend=len(groups) > 1, lines="median")
 
 
 def snapshots(run: RunSource, figure: Any, count: int = 4) -> Any:
@@ -270,10 +290,12 @@ def _style(index: int) -> dict[str, Any]:
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
 
 
-def _frame(axes: Axes, *, legend: bool) -> None:
+def _frame(axes: Axes, *, legend: bool, lines: str) -> None:
+    """No lines above and on the right, and a legend whose title says what lines and shaded regions are."""
     axes.spines[["top", "right"]].set_visible(False)
     if legend:
-        for text in axes.legend(frameon=False).get_texts():
+        title = f"{lines}, {100 * LEVEL:.0f} % interval" if axes.collections else lines
+        for text in axes.legend(frameon=False, title=title, alignment="left").get_texts():
             text.set_parse_math(False)
 
 
@@ -313,7 +335,7 @@ def _plane(data: RunData, axes: Axes) -> None:
         return
     axes.set_aspect("equal")
     for start, end in data.task.walls or ():
-        axes.plot(*np.transpose([start, end]), color=WALL, linewidth=2.5, solid_capstyle="butt", zorder=3)
+        axes.plot(*np.transpose([start, end]), color=WALL, linewidth=1.5, solid_capstyle="butt", zorder=3)
     if data.task.goal is not None:
         axes.plot(*data.task.goal, "o", markerfacecolor="none", markeredgecolor=PATH, markersize=9, markeredgewidth=2,
                   zorder=3)  # fmt: skip

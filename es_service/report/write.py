@@ -46,6 +46,8 @@ def write_report(
     trusted: bool = False,
     evaluate: EvaluateText | None = None,
     figures: AnyPath | None = None,
+    metrics: Sequence[str] = (),
+    against: str = "env_steps",
 ) -> list[Path]:
     """Write the report of one run and return the files written, the page first.
 
@@ -58,6 +60,8 @@ def write_report(
         trusted: whether a replay may execute code that the config of the run names, a task or a search of a user.
         evaluate: what evaluates a policy, as text; None: the Python call.
         figures: folder to write figures into; None: none are written.
+        metrics: columns of which curves are drawn as figures; none: all of `measures`.
+        against: axis of these curves; see `plots.curves`.
 
     Raises:
         ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty, or
@@ -83,7 +87,7 @@ def write_report(
     page = write_page(page, given_path(out or folder / REPORT), [elsewhere])
     if figures is None or not data.history["generation"].size:
         return [page]
-    return [page, *write_figures([data], given_path(figures))]
+    return [page, *write_figures([data], given_path(figures), metrics=metrics, against=against)]
 
 
 def write_comparison(
@@ -97,6 +101,7 @@ def write_comparison(
     statistics: AnyPath | None = None,
     bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     metrics: Sequence[str] = (),
+    against: str = "env_steps",
 ) -> list[Path]:
     """Write the page that compares runs and return the files written, the page first.
 
@@ -111,6 +116,7 @@ def write_comparison(
         bounds: task -> fitness that counts as 0 and as 1; with them, runs of several tasks can be compared, of which
             each group must have all.
         metrics: columns of the figures and of the file of statistics; none: all that all runs have.
+        against: axis of the curves of the figures; see `plots.curves`.
 
     Raises:
         ConfigError: the runs cannot be compared, grouped or paired, the file of statistics has another ending, or
@@ -129,10 +135,9 @@ def write_comparison(
         limit = compare.common_threshold(different) if threshold is None else threshold
         text = between.text_of(between.compared(groups, limit, paired=paired, metrics=metrics), kind)
         written.append(write_page(text, given_path(statistics)))
-    return [
-        *written,
-        *(write_figures(different, given_path(figures), group_by, threshold, metrics) if figures is not None else []),
-    ]
+    if figures is not None:
+        written += write_figures(different, given_path(figures), group_by, threshold, metrics, against)
+    return written
 
 
 def read_compared(folder: Path) -> RunData:

@@ -289,6 +289,8 @@ def test_figures_of_chosen_metrics_have_names_that_are_no_paths(runs, tmp_path):
     assert "best_fitness" not in names
     with pytest.raises(ConfigError, match=r"the measure coverge is unknown; must be .*; did you mean coverage"):
         write_figures(runs, tmp_path / "figures", metrics=["coverge"])
+    with pytest.raises(ConfigError, match="hours is no history column of all runs"):
+        write_figures(runs, tmp_path / "figures", metrics=["coverage"], against="hours")
 
 
 def map_of(run: RunData) -> BehaviourMap:
@@ -436,6 +438,11 @@ def test_an_overview_has_all_centres_of_each_group_in_the_same_colours(runs):
     assert len({points.get_clim() for axes in panels.values() for points in axes.collections}) == 1
     assert [axes.get_ylabel() for axes in below.axes] == ["best fitness", "coverage"]
     assert [text.get_text() for text in below.legends[0].get_texts()] == ["me_es", "es"]
+    assert below.legends[0].get_title().get_text() == "median, 95 % interval"
+    assert len(above.axes) == len(panels) + 1, "one bar of colours, and no empty panel"
+    assert {axes.get_xlabel() for axes in below.axes} == {"environment steps"}
+    draw_overview(runs, other := empty_figure(), against="wall_clock_s")
+    assert {axes.get_xlabel() for axes in other.subfigs[1].axes} == {"seconds"}
 
 
 def test_a_plot_of_a_path_is_the_stored_path(folders, axes):

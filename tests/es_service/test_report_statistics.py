@@ -22,6 +22,7 @@ from es_service.report.data import read_run
 from es_service.report.figures import empty_figure
 from es_service.report.measures import with_derived
 from es_service.report.statistics import median_interval
+from es_service.report.summary import number
 from es_service.report.write import write_comparison
 from tests.es_service.test_report_compare import words
 from tests.run_examples import write_run
@@ -200,6 +201,9 @@ def test_measures_of_groups_are_compared(runs):
 def test_a_page_says_what_so_few_runs_can_show(runs):
     said = words(comparison_page(runs, threshold=-75.0))
     assert "es over me_es" in said
+    assert "; p of its difference from me_es is 0.029; 7 of 8 runs reach -75.00." in said
+    share = 100 * runs[0].last("coverage")
+    assert f"coverage (%) group runs median interquartile mean es 4 {number(share)}" in said
     assert "The smallest corrected p that so many runs allow is 0.029." in said
     assert "Runs count as independent" in said
     assert "Wilcoxon" in words(comparison_page(runs, paired=True))
@@ -305,7 +309,9 @@ def test_files_of_statistics(runs, tmp_path):
     [pair] = [row for row in rows if row["measure"] == "best_fitness" and row["second"]]
     assert (pair["first"], pair["second"], float(pair["improvement"])) == ("es", "me_es", 1.0)
     latex = files[".tex"].read_text()
-    assert r"me\_es & 4 & -71.50 [-77.00, -70.00] &" in latex
+    assert r"me\_es & 4 & $-71.50$ [$-77.00$, $-70.00$] &" in latex
+    assert r" & coverage (\%) & " in latex
+    assert r"never]" in latex  # a run of four never reaches the target
     with pytest.raises(ConfigError, match=r"must end with one of .json, .csv, .tex"):
         write_comparison(runs, tmp_path / "c.html", statistics=tmp_path / "s.xlsx")
 
