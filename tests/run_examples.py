@@ -18,7 +18,7 @@ from es_service.protocol.messages import Moments, TaskSpec
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.maps.geometry import Geometry, Grid, make_geometry
+from es_service.search.maps.geometry import Cvt, Geometry, Grid, make_geometry
 from es_service.search.novelty import archive_of
 from es_service.search.steps import fresh_state
 from es_service.store.create import Beginning
@@ -182,8 +182,10 @@ def _filled(geometry: Geometry, share: float, rng: np.random.Generator) -> Behav
             (edges[:-1] + edges[1:])[index] / 2 for edges, index in zip(geometry.edges, index_N_B.T, strict=True)
         ]
         descriptor_N_B = np.stack(middle_N_B, axis=1).reshape(cells.size, len(geometry.bounds))
-    else:
+    elif isinstance(geometry, Cvt):
         descriptor_N_B = geometry.centroid_C_B[cells]
+    else:
+        descriptor_N_B = rng.uniform(*np.array(geometry.bounds).T, (cells.size, len(geometry.bounds)))
     fitness_N = -200.0 + 180.0 * rng.uniform(size=cells.size)
     zeros, none = np.zeros(cells.size, np.int64), np.zeros(cells.size, NAME)
     columns = (fitness_N, descriptor_N_B, zeros, zeros, fitness_N, none, none)

@@ -280,15 +280,23 @@ def print_map_summary(console: Console, run: Run, results: list[Fresh]) -> None:
     elites = [fresh for fresh in results if fresh.candidate.cell is not None]
     offset = run.constants["map.qd_offset"]
     stayed = sum(fresh.cell == fresh.candidate.cell for fresh in elites)
-    best: dict[int, float] = {}
-    for fresh in elites:
-        if fresh.cell is not None and math.isfinite(fresh.mean):
-            best[fresh.cell] = max(best.get(fresh.cell, -math.inf), fresh.mean)
-    stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
-    again = math.fsum(fitness - offset for fitness in best.values())
+    before, best = (
+        _best_of_cells([(fresh.candidate.cell, fresh.candidate.stored_fitness) for fresh in elites]),
+        _best_of_cells([(fresh.cell, fresh.mean) for fresh in elites]),
+    )
+    stored, again = (math.fsum(fitness - offset for fitness in values.values()) for values in (before, best))
     print_line(
         console,
         f"{len(elites)} elites: the mean descriptor of {stayed} still lies in their cell; a new map built from the "
         f"fresh values has {len(best)} filled cells.\n"
         f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh",
     )
+
+
+def _best_of_cells(places: list[tuple[int | None, float]]) -> dict[int, float]:
+    """Highest finite fitness in each cell."""
+    best: dict[int, float] = {}
+    for cell, fitness in places:
+        if cell is not None and math.isfinite(fitness):
+            best[cell] = max(best.get(cell, -math.inf), fitness)
+    return best

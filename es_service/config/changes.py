@@ -32,6 +32,8 @@ STATE_KEYS = (
     "map.bounds",
     "map.cells",
     "map.centroids",
+    "map.slots",
+    "map.neighbours",
 )
 """Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")

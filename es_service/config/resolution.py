@@ -226,10 +226,13 @@ def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:
     """Default number of cells: 1,024 for a cvt; for a grid, the cells along each dimension.
 
     These are 100 for one dimension and 20 x 20 for two. For more, all dimensions have the same number: the largest that
-    gives at most 10,000 cells in all, but at least 2.
+    gives at most 10,000 cells in all, but at least 2. The grid of a dominated map has one cell along all dimensions but
+    the first six.
     """
     if kind == "cvt":
         return (CVT_CELLS,)
+    if kind == "dominated" and dimensions > MOST_GRID_DIMENSIONS:
+        return (*default_cells("grid", MOST_GRID_DIMENSIONS), *(1,) * (dimensions - MOST_GRID_DIMENSIONS))
     each = {1: 100, 2: 20}.get(dimensions) or max(2, int(MOST_AUTO_CELLS ** (1.0 / dimensions) + 1e-9))
     return (each,) * dimensions
 

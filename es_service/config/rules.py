@@ -11,10 +11,10 @@ import math
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from es_service.config.given import start_of
-from es_service.config.keys import BUDGET, FIELDS
+from es_service.config.keys import BUDGET, FIELDS, search_fields
 from es_service.config.parts import LARGEST, RESOURCES, TASK_OPTIONS, counts
 from es_service.config.resolution import Unknown, Values, only_centres
 from es_service.config.search import SearchConfig
@@ -30,7 +30,7 @@ Rule = Callable[[Values, TaskSpec], Iterable[Problem]]
 Problems = Iterator[Problem]
 
 MOST_CELLS = 10_000_000
-MOST_CVT_CELLS = 4096
+MOST_CVT_CELLS = MOST_SLOTS = 4096
 PLACES_PER_CENTROID = {"lloyd": 50, "kmeans": 10}
 """Random places by which centroids are placed, by `map.centroids`."""
 LLOYD_STEPS = 20
@@ -193,7 +193,7 @@ def cells_fit(config: Values, task: TaskSpec) -> Problems:
     elif math.prod(cells) > most:
         allowed, hint = (
             f"at most {most:,}",
-            " for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt",
+            {"cvt": " for a cvt", "grid": "; with many dimensions use map.kind = cvt"}.get(kind, ""),
         )
         problem = f"{show(cells)} makes {math.prod(cells):,} cells; must be {allowed}{hint}"
     elif kind == "cvt" and (seconds := placing_seconds(cells[0], len(names), config["map.centroids"])) > MOST_PLACING_S:
@@ -207,9 +207,36 @@ def cells_fit(config: Values, task: TaskSpec) -> Problems:
 
 
 def centroids_are_for_a_cvt(config: Values, task: TaskSpec) -> Problems:
-    if config["map.kind"] == "grid" and (how := config["map.centroids"]) != "lloyd":
-        what = f"{show(how)} has no effect with map.kind = grid; leave it out (a key of kind cvt)"
+    if (kind := config["map.kind"]) != "cvt" and (how := config["map.centroids"]) != "lloyd":
+        what = f"{show(how)} has no effect with map.kind = {kind}; leave it out (a key of kind cvt)"
         yield problem_of("map.centroids", how, what, suggestion="lloyd")
+
+
+def slots_are_for_a_dominated_map(config: Values, task: TaskSpec) -> Problems:
+    if (kind := config["map.kind"]) == "dominated":
+        if (slots := config["map.slots"]) > MOST_SLOTS:
+            yield not_allowed("map.slots", slots, f"at most {MOST_SLOTS:,}")
+        return
+    for key in ("map.slots", "map.neighbours"):
+        if (value := config[key]) != (default := FIELDS[key].default):
+            what = f"{show(value)} has no effect with map.kind = {kind}; leave it out (a key of kind dominated)"
+            yield problem_of(key, value, what, suggestion=default)
+
+
+def slots_have_no_history(config: Values, task: TaskSpec) -> Problems:
+    """What is counted for a cell, or kept in it, would be of another elite as soon as a slot has one."""
+    if config["map.kind"] != "dominated" or "dominated" not in config.settings.map_kinds:
+        return
+    if (kind := config["search.elites.kind"]) != "once":
+        why = " with map.kind = dominated, whose slots have no places between which elites could move"
+        yield not_allowed("search.elites.kind", kind, "once", why=why)
+    for key in ("search.starts", "search.cell_sampling"):
+        if config.get(key) == "least_tried":
+            why = " with map.kind = dominated, whose slots change their elites"
+            others = [
+                name for name in get_args(search_fields(config.settings)[key].annotation) if name != "least_tried"
+            ]
+            yield not_allowed(key, "least_tried", one_of(others), why=why)
 
 
 def placing_seconds(cells: int, dimensions: int, centroids: str) -> float:
@@ -289,6 +316,13 @@ def method_has_its_map(config: Values, task: TaskSpec) -> Problems:
     if config.settings.needs_map and config["map.enabled"] is False:
         why = f" for {config['search.algorithm']}, {config.settings.needs_map}"
         yield not_allowed("map.enabled", False, "true", why=why)
+
+
+def method_can_fill_its_map(config: Values, task: TaskSpec) -> Problems:
+    kinds = config.settings.map_kinds
+    if config["map.enabled"] is not False and (kind := config["map.kind"]) not in kinds:
+        why = f" for {config['search.algorithm']}, which does not fill such a map"
+        yield not_allowed("map.kind", kind, one_of([*kinds, "auto"]), why=why)
 
 
 def method_has_its_start(config: Values, task: TaskSpec) -> Problems:
@@ -424,7 +458,12 @@ def run_ends(config: Values, task: TaskSpec) -> Problems:
         yield problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}")
 
 
-METHOD_RULES: tuple[Rule, ...] = (centres_fit_the_method, statistics_need_training, method_has_its_map)
+METHOD_RULES: tuple[Rule, ...] = (
+    centres_fit_the_method,
+    statistics_need_training,
+    method_has_its_map,
+    method_can_fill_its_map,
+)
 """Rules of what a method allows: if overrides replace the method of a file, values against them are left out."""
 RULES: tuple[Rule, ...] = (
     fitness_fits,
@@ -441,6 +480,8 @@ RULES: tuple[Rule, ...] = (
     qd_offset_is_finite,
     cells_fit,
     centroids_are_for_a_cvt,
+    slots_are_for_a_dominated_map,
+    slots_have_no_history,
     objectives_fit,
     nearest_elites_need_a_place,
     *METHOD_RULES,

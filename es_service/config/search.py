@@ -146,6 +146,8 @@ class SearchConfig(Section):
     """Keys whose smaller values keep new policies nearer to those of which they are made."""
     needs_map: ClassVar[str] = ""
     """What the method needs a behaviour map for, as a clause about it: "whose ..."; empty if it needs none."""
+    map_kinds: ClassVar[tuple[str, ...]] = ("grid", "cvt")
+    """Kinds of maps that it can fill. For `dominated`, a generation offers all that it has evaluated at once."""
     gathers_statistics: ClassVar[bool] = False
     """Whether it has training episodes, from which observation statistics are gathered."""
     unused: ClassVar[tuple[str, ...]] = (

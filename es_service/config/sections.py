@@ -156,8 +156,9 @@ class MapConfig(Section):
     """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
     enabled: Switch = Field(True, description="Whether the run fills a map; some methods need one.")
-    kind: Literal["grid", "cvt"] = Field(
+    kind: Literal["grid", "cvt", "dominated"] = Field(
         description="`grid`: cells of equal size. `cvt`: any number of cells around centroids, for many dimensions. "
+        "`dominated`: slots without a place; an elite stays by its distance from fitter ones. "
         "`auto`: `grid` for up to six dimensions, else `cvt`."
     )
     bounds: BoundPairs = Field(
@@ -166,7 +167,14 @@ class MapConfig(Section):
     )
     cells: CellCounts = Field(
         description="`grid`: number of cells along each dimension. `cvt`: one number, the number of all cells. "
+        "`dominated`: as for a grid, by which only coverage and QD-score are counted. "
         "`auto`: [100] for one dimension, [20, 20] for two, at most 10,000 cells in all for more; [1024] for a cvt."
+    )
+    slots: Count = Field(1024, description="Of kind `dominated`: number of elites that the map keeps, at most 4,096.")
+    neighbours: Count = Field(
+        3,
+        description="Of kind `dominated`: an elite stays by the mean distance of its descriptor to those of this many "
+        "nearest fitter ones, in units of the descriptor.",
     )
     centroids: Literal["lloyd", "kmeans"] = Field(
         "lloyd",

@@ -28,7 +28,7 @@ from es_service.protocol.content import Contents
 from es_service.protocol.messages import EpisodesResult, Moments
 from es_service.search.algorithms.base import CentreEvaluations, SearchState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
-from es_service.search.maps.geometry import reachable_cells
+from es_service.search.maps.geometry import reachable_cells, tessellation
 from es_service.search.steps import norm
 
 Reachable = NDArray[np.bool_] | None
@@ -83,8 +83,8 @@ class Finished:
 
 
 def reachable_in(search: Search, state: RunState) -> Reachable:
-    """The cells of a run's map that can be reached."""
-    return None if state.search.map is None else reachable_cells(state.search.map.geometry, search.task)
+    """The cells of a run's map, or of the grid by which its coverage is counted, that can be reached."""
+    return None if state.search.map is None else reachable_cells(tessellation(state.search.map.geometry), search.task)
 
 
 def finish(

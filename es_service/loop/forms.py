@@ -36,7 +36,10 @@ _KINDS: Mapping[str, Mapping[str, str]] = {
 }
 """Kind of a node -> kinds of the arrays that it has."""
 _MORE = {
-    GEOMETRY: {"bounds": REAL, "shape": INTEGER, "centroid_C_B": REAL},
+    GEOMETRY: {
+        **{"bounds": REAL, "shape": INTEGER, "centroid_C_B": REAL},
+        **dict.fromkeys(("grid_shape", "slots", "neighbours"), INTEGER),
+    },
     MAP: {"samples_N": INTEGER},
     CENTRES: {"own_mean_O": REAL, "own_std_O": REAL},
 }
@@ -57,11 +60,13 @@ class Sizes(NamedTuple):
     dimensions: int
     """Of the descriptor."""
     cells: tuple[int, ...] | None
-    """Cells of the map along each dimension, or of a cvt map; None without one."""
+    """Cells of the map, or of the grid of a dominated one, along each dimension, or of a cvt map; None without one."""
     bounds: tuple[tuple[float, float], ...]
     """(low, high) of each dimension of the map."""
     step: Mapping[str, str] = {}
     """Name of an array of a centre's step -> the kinds that it may have."""
+    dominated: Mapping[str, int] = {}
+    """`slots` and `neighbours` of a dominated map; empty for another."""
 
     @property
     def lengths(self) -> dict[str, int]:
@@ -122,7 +127,7 @@ def _fits(axis: str, length: int, lengths: dict[str, int]) -> bool:
 
 def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
     """As `problem`, for what the values must be."""
-    count = math.prod(sizes.cells or (0,))
+    count = sizes.dominated.get("slots", math.prod(sizes.cells or (0,)))
     if kind == MAP and not ((arrays["cell_N"] >= 0) & (arrays["cell_N"] < count)).all():
         return f"has a cell that is none of a map of {count} cells"
     if kind == GEOMETRY:
@@ -140,9 +145,15 @@ def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes
 def _problem_of_geometry(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
     """As `problem`, for the cells of a map; a block of centroids has some of them."""
     bounds, shape, centroid_C_B = (arrays.get(name) for name in ("bounds", "shape", "centroid_C_B"))
-    of_grid = [] if shape is None else [shape.tolist()]
-    of_cvt = [] if centroid_C_B is None else [[len(centroid_C_B)]]
-    if of_grid + of_cvt != [list(sizes.cells or ())] or bounds is None or bounds.tolist() != [*map(list, sizes.bounds)]:
+    if sizes.dominated:
+        wanted = {**sizes.dominated, "grid_shape": list(sizes.cells or ())}
+        found = {name: array.tolist() for name, array in arrays.items() if name != "bounds"}
+    else:
+        of_cvt = [] if centroid_C_B is None else [[len(centroid_C_B)]]
+        wanted, found = [list(sizes.cells or ())], ([] if shape is None else [shape.tolist()]) + of_cvt
+        if "slots" in arrays:
+            return "has slots, but the map of the config has cells"
+    if found != wanted or bounds is None or bounds.tolist() != [*map(list, sizes.bounds)]:
         return "has other cells or bounds than the config"
     if centroid_C_B is not None:
         low_B, high_B = bounds.T

@@ -67,12 +67,14 @@ _GOAL_OF_CENTRE = (
 )
 _CELL = (
     "cell of the map that the new centre entered; none if it did not. A number: those of a grid run along its last "
-    "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both"
+    "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both. Of a dominated map, the slot"
 )
 _MAP = (
     Column("start_cell", "INTEGER", True, "me_es, memes: cell whose elite this generation began with, if it drew one"),
     Column("cell", "INTEGER", True, _CELL),
-    Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
+    Column(
+        "map_cells", "INTEGER", True, "filled cells of the map after this generation; of a dominated map, of its grid"
+    ),
     Column("coverage", "REAL", True, "filled cells as a fraction of all"),
     Column("coverage_reachable", "REAL", True, "the same of the cells that can be reached, where the task knows them"),
     Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it entered or as all its samples say"),

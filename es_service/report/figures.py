@@ -146,7 +146,8 @@ def write_figures(
     if len(runs) == 1:
         if mapped:
             drawings["behaviour_map"] = lambda figure: _map(mapped[0], figure.subplots())
-            drawings["behaviour_map_over_time"] = lambda figure: _snapshots(mapped[0], figure)
+            if mapped[0].constants["map.kind"] != "dominated":
+                drawings["behaviour_map_over_time"] = lambda figure: _snapshots(mapped[0], figure)
             if len(mapped[0].names) == 2:
                 drawings["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
         drawings["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")

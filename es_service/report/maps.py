@@ -5,6 +5,7 @@
 - A grid of more: a heat map of heat maps, in which the dimensions alternate between right and up; the first ones give
   the large blocks, the last ones the cells inside them.
 - A cvt map of more: the elites as points, one figure for each pair of the first four dimensions.
+- A dominated map: the elites as points, at their descriptors.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from es_service.report.data import RunData
 from es_service.report.floor import Range, detours
 from es_service.report.markup import LEVELS, SCALE, Frame, Markup, joined, level, packed, spread, tag, value_range
 from es_service.report.summary import number
-from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
-from es_service.search.maps.geometry import Cvt, Grid, intervals
+from es_service.search.maps.behaviour_map import BehaviourMap, empty_map, projected
+from es_service.search.maps.geometry import Cvt, Dominated, Grid, intervals, tessellation
 
 SMALL = 250
 """Width of a figure when several are shown side by side."""
@@ -56,6 +57,9 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
                 if parts
                 else ""
             )
+        elif isinstance(map_.geometry, Dominated):
+            shapes = _points(map_, frame, level_N, *map_.descriptor_N_B.T)
+            text = "Each point is an elite, at its descriptor; its colour is its fitness."
         else:
             shapes = _voronoi(map_, frame, level_N)
         path = tag("g", class_="path")  # of a chosen cell
@@ -63,8 +67,10 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
         return _svg(content, *floor.size(frame)), text, frame
     if dimensions == 1:
         text = "Each bar is a cell; its height is the fitness of its elite."
-        return _bars(map_, data.names, level_N, colours), text, None
-    if isinstance(map_.geometry, Cvt):
+        if isinstance(map_.geometry, Dominated):
+            text = "Each point is an elite, at its descriptor and its fitness."
+        return _of_one_dimension(map_, data.names, level_N, colours), text, None
+    if not isinstance(map_.geometry, Grid):
         text = (
             f"Each point is an elite, at its place in {min(dimensions, PAIRED_DIMENSIONS)} of {dimensions} dimensions."
         )
@@ -74,8 +80,8 @@ def draw_map(data: RunData, colours: Range | None = None) -> tuple[Markup, str, 
 
 def has_area(map_: BehaviourMap) -> bool:
     """Whether the figure of a map is covered by its cells, so that empty ones are seen."""
-    dimensions = len(map_.geometry.bounds)
-    return dimensions == 2 or (dimensions > 2 and isinstance(map_.geometry, Grid))
+    dimensions, kind = len(map_.geometry.bounds), type(map_.geometry)
+    return (dimensions == 2 and kind is not Dominated) or (dimensions > 2 and kind is Grid)
 
 
 def empty_pattern() -> Markup:
@@ -155,15 +161,35 @@ def _voronoi(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> li
     return polygons
 
 
-def _bars(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64], colours: Range) -> Markup:
+def _of_one_dimension(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64], colours: Range) -> Markup:
     low, high = spread([map_.fitness_N, np.array(colours)])
     frame = Frame(map_.geometry.bounds[0], (low, high), 64, 8, floor.WIDTH - 74, 220)
-    across, bottom = frame.across(intervals(map_.geometry)).tolist(), frame.top + frame.height
-    bars = [
-        _rectangle(cell, colour, across[cell][0], top, across[cell][1], bottom)
-        for cell, colour, top in zip(map_.cell_N, level_N, frame.down(np.maximum(map_.fitness_N, low)), strict=True)
+    bottom, height_N = frame.top + frame.height, np.maximum(map_.fitness_N, low)
+    if isinstance(map_.geometry, Dominated):
+        shapes = _points(map_, frame, level_N, map_.descriptor_N_B[:, 0], height_N)
+    else:
+        across = frame.across(intervals(map_.geometry)).tolist()
+        shapes = [
+            _rectangle(cell, colour, across[cell][0], top, across[cell][1], bottom)
+            for cell, colour, top in zip(map_.cell_N, level_N, frame.down(height_N), strict=True)
+        ]
+    return _svg([axis_lines(frame, names[0]), *shapes], floor.WIDTH, bottom + 40)
+
+
+def _points(
+    map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64], x_N: NDArray[np.float64], y_N: NDArray[np.float64]
+) -> list[Markup]:
+    """The elites as points, those outside of the frame at its border."""
+    return [
+        Markup(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{SCALE[colour]}" data-c="{cell}"/>')
+        for cell, colour, x, y in zip(
+            map_.cell_N.tolist(),
+            level_N.tolist(),
+            frame.across(np.clip(x_N, *frame.x)),
+            frame.down(np.clip(y_N, *frame.y)),
+            strict=True,
+        )
     ]
-    return _svg([axis_lines(frame, names[0]), *bars], floor.WIDTH, bottom + 40)
 
 
 def _stacked(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64]) -> tuple[Markup, str, None]:
@@ -197,16 +223,7 @@ def _pairs(map_: BehaviourMap, names: Sequence[str], level_N: NDArray[np.int64])
     figures = []
     for a, b in combinations(range(min(len(bounds), PAIRED_DIMENSIONS)), 2):
         frame = Frame(bounds[a], bounds[b], floor.LEFT, 8, SMALL - 62, SMALL - 62)
-        points = [
-            Markup(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{SCALE[colour]}" data-c="{cell}"/>')
-            for cell, colour, x, y in zip(
-                map_.cell_N.tolist(),
-                level_N.tolist(),
-                frame.across(np.clip(map_.descriptor_N_B[:, a], *bounds[a])),
-                frame.down(np.clip(map_.descriptor_N_B[:, b], *bounds[b])),
-                strict=True,
-            )
-        ]
+        points = _points(map_, frame, level_N, map_.descriptor_N_B[:, a], map_.descriptor_N_B[:, b])
         content = [floor.ground(frame, (names[a], names[b])), *points]
         figures.append(_svg(content, *floor.size(frame), class_="map small"))
     return tag("div", *figures, class_="pairs")
@@ -296,11 +313,12 @@ Over = Literal["share", "median"]
 
 def over_seeds(runs: Sequence[RunData], over: Over) -> RunData:
     """The first of several runs with a map that tells of all: in each cell that any of them has filled, the share of
-    the runs that have filled it, or the median fitness of those that have.
+    the runs that have filled it, or the median fitness of those that have. The cells of a dominated map are those of
+    its grid.
 
     Raises ValueError if the runs have no maps, or maps with different cells.
     """
-    maps = [run.map for run in runs if run.map is not None]
+    maps = [projected(run.map) for run in runs if run.map is not None]
     first = maps[0].geometry if maps else None
     if len(maps) < len(runs) or any(
         map_.geometry.size != first.size or map_.geometry.bounds != first.bounds for map_ in maps if first is not None
@@ -324,7 +342,7 @@ def over_seeds(runs: Sequence[RunData], over: Over) -> RunData:
 def until(data: RunData, generation: int) -> RunData:
     """A run with the map that all evaluated centres until a generation make, each cell with the fittest.
 
-    It is the run's own map at that time, unless the search measures elites again.
+    It is the run's own map at that time, unless the search measures elites again. Not for a dominated map.
     """
     assert data.map is not None
     order = np.lexsort((-data.centres["fitness_mean"], data.centres["generation"] > generation))
@@ -332,14 +350,15 @@ def until(data: RunData, generation: int) -> RunData:
     descriptor_N_B = np.stack([data.centres[name][order] for name in data.names], axis=1)
     fitness_N = data.centres["fitness_mean"][order]
     fine = np.isfinite(descriptor_N_B).all(axis=1) & np.isfinite(fitness_N)
-    cell_N = data.map.geometry.cells_of(descriptor_N_B[fine])
+    cell_N = tessellation(data.map.geometry).cells_of(descriptor_N_B[fine])
     cell_N, first_N = np.unique(cell_N, return_index=True)  # the first is the fittest
     return replace(data, map=_with(data.map, cell_N, fitness_N[fine][first_N], descriptor_N_B[fine][first_N]))
 
 
 def profile(map_: BehaviourMap, fitness_K: NDArray[np.float64]) -> NDArray[np.float64]:
     """Share of all cells of a map whose elite has at least each fitness, [K]: its archive profile (Flageat et al.,
-    ACM TELO 2022)."""
+    ACM TELO 2022). Of a dominated map, the cells are those of its grid."""
+    map_ = projected(map_)
     ordered = np.sort(map_.fitness_N)
     return (ordered.size - np.searchsorted(ordered, fitness_K, side="left")) / map_.geometry.size
 

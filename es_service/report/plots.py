@@ -26,7 +26,7 @@ from es_service.report.measures import measure_named
 from es_service.report.series import X_AXES, axes_of, lone
 from es_service.runs.selection import LEVEL
 from es_service.runs.view import Run
-from es_service.search.maps.geometry import Grid, intervals
+from es_service.search.maps.geometry import Cvt, Dominated, Grid, Tessellation, intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,8 @@ def behaviour_map(run: RunSource, axes: Axes, colours: tuple[float, float] | Non
     """Draw the behaviour map of a run with a descriptor of one or two dimensions, with its walls and its goal.
 
     A cvt map of two dimensions has a hexagon for each elite, at the centroid of its cell. If the task has walls, it is
-    at the elite's descriptor, since the centroid may be on the other side of a wall.
+    at the elite's descriptor, since the centroid may be on the other side of a wall. Those of a dominated map always
+    are; in one dimension, the other axis is their fitness.
 
     Args:
         colours: fitness of the first and last colour; None: those of this map.
@@ -67,12 +68,15 @@ def behaviour_map(run: RunSource, axes: Axes, colours: tuple[float, float] | Non
         "norm": importlib.import_module("matplotlib.colors").Normalize(low, high),
     }
     if len(data.names) == 1:
-        bars = collections.PolyCollection(_bars(data), array=map_.fitness_N, **style)
-        axes.add_collection(bars)
+        if isinstance(geometry, Dominated):
+            shapes = axes.scatter(map_.descriptor_N_B[:, 0], map_.fitness_N, c=map_.fitness_N, **style)
+        else:
+            shapes = collections.PolyCollection(_bars(data, geometry), array=map_.fitness_N, **style)
+            axes.add_collection(shapes)
         axes.set(xlim=data.bounds[0])
         _name_axes(axes, data.names[0], "fitness")
         axes.set_ylim(min(low, float(map_.fitness_N.min(initial=low))), high)
-        return bars
+        return shapes
     _plane(data, axes)
     if isinstance(geometry, Grid):
         filled, parts = np.full(geometry.shape, np.nan), beside_walls(map_, data.task)
@@ -84,9 +88,9 @@ def behaviour_map(run: RunSource, axes: Axes, colours: tuple[float, float] | Non
         beside = np.array([fitness_of[cell] for cell in parts])
         axes.add_collection(collections.PolyCollection(corners, array=beside, zorder=1.1, **style))
         return axes.pcolormesh(*geometry.edges, filled.T, zorder=1, rasterized=True, **style)
-    place_N_2 = geometry.centroid_C_B[map_.cell_N]
-    if data.task.walls:
-        place_N_2 = np.clip(map_.descriptor_N_B, *np.transpose(data.bounds))
+    place_N_2 = np.clip(map_.descriptor_N_B, *np.transpose(data.bounds))
+    if isinstance(geometry, Cvt) and not data.task.walls:
+        place_N_2 = geometry.centroid_C_B[map_.cell_N]
     return axes.scatter(*place_N_2.T, c=map_.fitness_N, marker="h", zorder=1, **style)
 
 
@@ -268,12 +272,15 @@ def snapshots(run: RunSource, figure: Any, count: int = 4) -> Any:
         figure: an empty figure of matplotlib, or a part of one.
 
     Returns:
-        what `Figure.colorbar` takes. Raises NotInRunError as `behaviour_map`.
+        what `Figure.colorbar` takes. Raises NotInRunError as `behaviour_map`, and for a dominated map.
     """
     data = _data(run)
     steps_G, generation_G = data.history["env_steps"], data.history["generation"]
     if data.map is None or not steps_G.size:
         raise NotInRunError(f"{data.folder} has no behaviour map", run=data.folder)
+    if isinstance(data.map.geometry, Dominated):
+        what = "a dominated map, whose earlier elites do not follow from what was evaluated until then alone"
+        raise NotInRunError(f"{data.folder} has {what}", run=data.folder)
     colours, drawn = value_range(data.map.fitness_N), None
     panels = figure.subplots(1, count, squeeze=False, sharey=True).ravel()
     for k, axes in enumerate(panels):
@@ -312,9 +319,9 @@ def _data(run: RunSource) -> RunData:
     return read_run(run.folder if isinstance(run, Run) else given_path(run), paths=False, digest=False)
 
 
-def _bars(data: RunData) -> list[list[tuple[float, float]]]:
+def _bars(data: RunData, geometry: Tessellation) -> list[list[tuple[float, float]]]:
     assert data.map is not None
-    ends_N_2, floor = intervals(data.map.geometry)[data.map.cell_N].tolist(), value_range(data.map.fitness_N)[0]
+    ends_N_2, floor = intervals(geometry)[data.map.cell_N].tolist(), value_range(data.map.fitness_N)[0]
     return [
         [(low, floor), (low, fitness), (high, fitness), (high, floor)]
         for (low, high), fitness in zip(ends_N_2, data.map.fitness_N.tolist(), strict=True)

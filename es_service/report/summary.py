@@ -26,6 +26,7 @@ from es_service.runs.run_status import invalid_members, objectives, population_s
 from es_service.runs.selection import RankedBy
 from es_service.search.algorithms import OURS
 from es_service.search.algorithms.settings import UndeclaredSettings
+from es_service.search.maps.behaviour_map import projected
 
 
 class Fault(NamedTuple):
@@ -57,8 +58,10 @@ def verdict(data: RunData) -> str:
         least = float(np.nanmin(data.history["goal_distance_min"]))
         sentence += f"; the nearest that an evaluated episode came to the goal is {number(least)}"
     if data.map is not None:
-        cells, size = data.map.size, data.map.geometry.size
-        sentence += f"; {cells:,} of {size:,} cells of the behaviour map are filled ({100 * cells / size:.1f} %)"
+        map_ = projected(data.map)
+        whose = "" if map_ is data.map else "the grid of "
+        cells, size = map_.size, map_.geometry.size
+        sentence += f"; {cells:,} of {size:,} cells of {whose}the behaviour map are filled ({100 * cells / size:.1f} %)"
     return f"{_certified(data)}{_elsewhere(data)}{sentence}."
 
 

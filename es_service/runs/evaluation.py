@@ -28,6 +28,8 @@ from es_service.runs.engine import engine_here
 from es_service.runs.snapshot import Snapshot, acting
 from es_service.runs.view import Run, named_best
 from es_service.runs.worker_count import on_this_machine, require_cores
+from es_service.search.maps.behaviour_map import places_of
+from es_service.search.maps.geometry import tessellation
 
 CHUNKS_PER_WORKER = 16
 """Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""
@@ -52,7 +54,8 @@ class Candidate:
     stored_fitness: float
     """Mean fitness that the run stored for it."""
     cell: int | None = None
-    """Number of its cell; None if it is not an elite. The next two are of an elite too."""
+    """Number of its cell, or of that of the grid of a dominated map; None if it is not an elite. The next two are of an
+    elite too."""
     centre: int | None = None
     """Number of the evaluated centre or policy."""
     trace_T_B: FloatArray | None = None
@@ -144,13 +147,14 @@ def candidates(
     map_, elites = run.elites(None if every else wanted, generation)
     if not elites and (cells or every):
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
+    place_N = places_of(map_).tolist()
     for cell, elite in elites.items():
         row = map_.row_of(cell)
         assert row is not None
         name = ",".join(map(str, map_.geometry.index_of(cell)))
         evaluated = int(map_.generation_N[row]), float(map_.fitness_N[row])
         chosen.append(
-            Candidate(name, acting(run.meta, elite), *evaluated, cell, int(map_.centre_N[row]), elite.trace_T_B)
+            Candidate(name, acting(run.meta, elite), *evaluated, place_N[row], int(map_.centre_N[row]), elite.trace_T_B)
         )
     return chosen
 
@@ -187,7 +191,7 @@ def evaluate(
     `evaluation_config`.
     """
     config = evaluation_config(run, workers)
-    geometry = run.behaviour_map.geometry if config.map.enabled else None
+    cells = tessellation(run.behaviour_map.geometry) if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     task = task_of(config)
     outputs = ("success",) if task.success else ()
@@ -200,8 +204,8 @@ def evaluate(
                 group, _totals(engine, centres, episodes), strict=True
             ):
                 cell = None
-                if geometry is not None and np.isfinite(descriptors.mean_O).all():
-                    cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
+                if cells is not None and np.isfinite(descriptors.mean_O).all():
+                    cell = int(cells.cells_of(descriptors.mean_O[None])[0])
                 yield Fresh(candidate, fitness, descriptors, successes if task.success else None, cell)
 
 

@@ -149,7 +149,8 @@ def ribs_archive(run: Run) -> Any:
     map_, elites = run.elites()
     if not isinstance(map_.geometry, Grid):
         raise NotInRunError(
-            f"the map of {run.folder} is a cvt map, but a GridArchive needs a grid; export to npz instead",
+            f"the map of {run.folder} is of kind {run.constants['map.kind']}, but a GridArchive needs a grid; export "
+            "to npz instead",
             run=run.folder,
         )
     if not map_.size:

@@ -287,7 +287,7 @@ def same_descriptor(task: TaskSpec, descriptor_B: Sequence[float], where: str) -
 
 def _placing_sentence(config: MapConfig) -> str:
     """That centroids of the map are placed, if this takes long; else empty."""
-    if not config.enabled or config.kind == "grid":
+    if not config.enabled or config.kind != "cvt":
         return ""
     cells, dimensions = config.cells[0], len(config.bounds)
     seconds = placing_seconds(cells, dimensions, config.centroids)

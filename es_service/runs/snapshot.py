@@ -61,7 +61,11 @@ def sizes_of(meta: RunMeta) -> Sizes:
     bounds = tuple((low, high) for low, high in meta.constants["map.bounds"] or ()) if has_map else ()
     step, kinds = STEPS.get(meta.constants.get("search.step.kind") or ""), {"i": INTEGER, "f": REAL}
     of_step = {} if step is None else {name: kinds[array.dtype.kind] for name, array in step.fresh(1).items()}
-    return Sizes(stored_policy_spec(meta).parameters, meta.task["observation_size"], dimensions, cells, bounds, of_step)
+    parameters, observation = stored_policy_spec(meta).parameters, meta.task["observation_size"]
+    dominated = {}
+    if has_map and meta.constants.get("map.kind") == "dominated":
+        dominated = {name: meta.constants[f"map.{name}"] for name in ("slots", "neighbours")}
+    return Sizes(parameters, observation, dimensions, cells, bounds, of_step, dominated)
 
 
 def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:

@@ -167,13 +167,13 @@ class Run:
     @property
     def map(self) -> pd.DataFrame:
         """The behaviour map, one row per filled cell in the order of discovery: the cell's number (as in the history)
-        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre,
+        and its index along each dimension (only for a grid); the elite's fitness, descriptor, generation and centre,
         and the number of its samples where the search counts them.
         """
         return self.at(wanted=[MAP]).map
 
     def cell(self, place: int | Sequence[int]) -> int:
-        """Number of the filled cell at a place: its indices, such as (3, 17), or its number in a cvt map, such as 1023.
+        """Number of the filled cell at a place: its indices, such as (3, 17), or its number in a map of another kind.
 
         Raises NotInRunError if the cell does not exist or is empty; the message names the nearest filled cell.
         """

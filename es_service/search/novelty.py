@@ -269,10 +269,10 @@ def _mean_nearest(
     tree = archive.tree
     asked = neighbours + 1 + SPARE_CANDIDATES  # + 1 in case the excluded entry is among them
     if tree is None or asked >= tree.kd.n or (tree.entry_K is not None and asked > COPIES):
-        return _mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
+        return mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
     reach_Q_K, point_Q_K = tree.kd.query(query_Q_B, asked)
     candidate_Q_K = tree.entries_of(point_Q_K)
-    near_Q_K = _squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
+    near_Q_K = squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
     near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
     tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.entries)
     squared_Q_K = _smallest(near_Q_K, neighbours)
@@ -280,14 +280,14 @@ def _mean_nearest(
     squared_Q_K[newer] = _smallest(np.concatenate([squared_Q_K[newer], tail_Q_N[newer]], axis=1), neighbours)
     # A result is sure unless an entry that the tree did not return could, with rounding, be among the nearest.
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
-    mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
+    mean_Q = mean_smallest(squared_Q_K, neighbours, distance)
     for index in np.flatnonzero(~sure_Q):  # such as many entries at equal distance, where episodes end at a border
         single = slice(index, index + 1)
         radius = reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)
         within = tree.entries_of(tree.kd.query_ball_point(query_Q_B[index], radius))
-        near_1_K = _squared_to(query_Q_B[single], archive.descriptor_N_B[None, within])
+        near_1_K = squared_to(query_Q_B[single], archive.descriptor_N_B[None, within])
         near_1_K[:, within == excluded_Q[index]] = np.inf
-        mean_Q[single] = _mean_smallest(np.concatenate([near_1_K, tail_Q_N[single]], axis=1), neighbours, distance)
+        mean_Q[single] = mean_smallest(np.concatenate([near_1_K, tail_Q_N[single]], axis=1), neighbours, distance)
     return mean_Q
 
 
@@ -295,13 +295,13 @@ def _squared(
     archive: NoveltyArchive, query_Q_B: NDArray[np.float64], excluded_Q: NDArray[np.int64], first: int = 0
 ) -> NDArray[np.float64]:
     """Squared distances [Q, N - first] to the entries from `first` on, infinite for the excluded entry."""
-    squared_Q_N = _squared_to(query_Q_B, archive.descriptor_N_B[None, first:])
+    squared_Q_N = squared_to(query_Q_B, archive.descriptor_N_B[None, first:])
     rows = np.flatnonzero(excluded_Q >= first)
     squared_Q_N[rows, excluded_Q[rows] - first] = np.inf
     return squared_Q_N
 
 
-def _squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
+def squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared distances [Q, N], (x0 - y0)^2 + (x1 - y1)^2 + ... in this order; the only place that computes them."""
     total_Q_N = np.zeros(np.broadcast_shapes((len(query_Q_B), 1), entry_Q_N_B.shape[:2]))
     squared_Q_N = np.empty_like(total_Q_N)
@@ -318,7 +318,7 @@ def _smallest(squared_Q_N: NDArray[np.float64], count: int) -> NDArray[np.float6
     return np.sort(squared_Q_N, axis=1)
 
 
-def _mean_smallest(squared_Q_N: NDArray[np.float64], count: int, distance: Distance) -> NDArray[np.float64]:
+def mean_smallest(squared_Q_N: NDArray[np.float64], count: int, distance: Distance) -> NDArray[np.float64]:
     """Mean of the `count` smallest finite distances of each row, [Q]; 0 for a row without any."""
     squared_Q_K = _smallest(squared_Q_N, count)
     distance_Q_K = np.sqrt(squared_Q_K) if distance == "euclidean" else squared_Q_K

@@ -3,6 +3,7 @@
     python -m tests.benchmarks.certified                                   # all that is missing: hours on two cores
     python -m tests.benchmarks.certified --task ant_trap --method nsr_es me_es --seeds 0:2
     python -m tests.benchmarks.certified --physics mujoco                  # AntMaze and AntTrap by MuJoCo's equations
+    python -m tests.benchmarks.certified --map grid dominated --task point_maze --seeds 0:3 --marks 1e7
     python -m tests.benchmarks.certified --table                           # only print the tables
     python -m tests.benchmarks.certified --config my.yaml --seeds 100:101 --marks 30_000_000 --set search.sigma=0.05
 
@@ -14,6 +15,9 @@ are printed and added to results/certified_trials.csv.
 
 With `--physics mujoco`, the ants are trained with `physics: mujoco_euler` and certified in C MuJoCo, too, with Gym's
 model and its integrator RK4: the columns `elsewhere_*` of results/certified_mujoco.csv.
+
+With `--map`, the methods that can fill a dominated map fill maps of these kinds, with as many slots as the grid has
+cells; results/certified_maps.csv has coverage and QD-score, too, which are counted by the same grid.
 """
 
 from __future__ import annotations
@@ -36,18 +40,23 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 RUNS = ROOT / "runs" / "certified_methods"
 RESULTS = Path(__file__).parent / "results" / "certified_methods.csv"
-TRIALS, MUJOCO = (RESULTS.with_name(f"certified_{name}.csv") for name in ("trials", "mujoco"))
+TRIALS, MUJOCO, MAPS = (RESULTS.with_name(f"certified_{name}.csv") for name in ("trials", "mujoco", "maps"))
 TASKS = ("point_maze", "ant_maze", "ant_trap")
 SHIPPED = ("memes", "map_elites")
 METHODS = ("es", "ns_es", "nsr_es", "nsra_es", "me_es", *SHIPPED, "ars")
 MARKS = (1_000_000, 10_000_000, 100_000_000)
 RUN = ["task", "method", "settings", "seed"]
+COUNTED = ["coverage", "qd_score"]
 SEEDS = 5
 EULER = "task.options.physics=mujoco_euler"
 IN_C = {"ant_maze": "gymnasium:es_service/AntMazeMujoco-v0", "ant_trap": "gymnasium:es_service/AntTrapMujoco-v0"}
 """Task -> the same one in C MuJoCo."""
 MUJOCO_SEEDS = {"memes": 5, "nsra_es": 5, "me_es": 3, "map_elites": 3, "ars": 3}
 """Method -> number of its seeds in MuJoCo, which begin with 0."""
+KINDS = {"grid": ("map.kind=grid",), "dominated": ("map.kind=dominated", "map.slots=400")}
+"""Kind of a map -> settings of its runs."""
+MAPPED = ("me_es", *SHIPPED)
+"""Methods that can fill each."""
 
 
 class Shown(NamedTuple):
@@ -104,6 +113,8 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
             "env_steps": int(then.env_steps),
             "seconds": round(float(then.wall_clock_s)),
         }
+        if {*wanted.settings}.intersection(kind for kind, *_ in KINDS.values()):
+            of_run |= {name: float(then[name]) for name in COUNTED}
         rows.append(of_run | policy.row() | {"cpu": cpu_kind(), "commit": code})
     return pd.DataFrame(rows)
 
@@ -158,6 +169,24 @@ def in_words(table: pd.DataFrame, columns: str = "") -> str:
     return "\n".join(lines)
 
 
+def maps_in_words(table: pd.DataFrame) -> str:
+    """The maps in Markdown: medians over the seeds, with the range."""
+    head = ["task", "method", "map", "steps", "seeds", "certified return", "coverage, %", "QD-score, thousands"]
+    lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
+    factors = {"return_mean": 1.0, "coverage": 100.0, "qd_score": 1e-3}
+    for (task, method, settings), of_settings in table.groupby(["task", "method", "settings"], sort=True):
+        kind = next(kind for kind, (setting, *_) in KINDS.items() if setting in settings.split())
+        for _, rows in of_settings.groupby("certification"):
+            values = [_range(rows[column] * factor) for column, factor in factors.items()]
+            steps = f"{rows.env_steps.min():.1e}".replace("e+0", "e")
+            lines.append(f"| {' | '.join([task, method, kind, steps, str(len(rows)), *values])} |")
+    return "\n".join(lines)
+
+
+def _range(values: pd.Series) -> str:
+    return f"**{_number(values.median())}** ({_number(values.min())} to {_number(values.max())})"
+
+
 def _cell(of_method: pd.DataFrame, column: str, mark: int) -> str:
     """Median and range over the seeds, of the first row of each from the mark on; and how many seeds, if not five."""
     values = of_method[of_method.env_steps >= mark].sort_values("env_steps").groupby("seed")[column].first()
@@ -180,23 +209,28 @@ def main() -> None:
     parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
     parser.add_argument("--seeds", metavar="A:B", help="default: 0:5, or those that the table in MuJoCo has")
     parser.add_argument("--physics", choices=("spring", "mujoco"), default="spring")
+    parser.add_argument("--map", nargs="+", choices=KINDS, default=[], help="kinds of maps to compare")
     parser.add_argument("--marks", nargs="+", type=lambda text: int(float(text.replace("_", ""))), default=MARKS)
     parser.add_argument("--table", action="store_true", help="run nothing")
     parser.add_argument("--config", type=Path, help="a trial: a config of your own")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of a trial")
     given = parser.parse_args()
     in_mujoco, trial = given.physics == "mujoco", given.config is not None
-    path = TRIALS if trial else MUJOCO if in_mujoco else RESULTS
+    path = TRIALS if trial else MUJOCO if in_mujoco else MAPS if given.map else RESULTS
     if given.set and not trial:
         parser.error("--set needs --config")
+    if given.map and (trial or in_mujoco):
+        parser.error("--map does not go with --config and --physics mujoco")
     settings = (*([EULER] if in_mujoco else []), *given.set)
     tasks = [task for task in given.task if task in IN_C or not in_mujoco]
-    methods = [method for method in given.method if method in MUJOCO_SEEDS or not in_mujoco]
+    able = MUJOCO_SEEDS if in_mujoco else MAPPED if given.map else METHODS
+    methods = [method for method in given.method if method in able]
     count = dict.fromkeys(METHODS, SEEDS) | (MUJOCO_SEEDS if in_mujoco else {})
     chosen = [(given.config, SEEDS)] if trial else [(config_of(a, b), count[b]) for a in tasks for b in methods]
     wanted = [
-        Wanted(config, seed, tuple(given.marks), settings)
+        Wanted(config, seed, tuple(given.marks), (*settings, *KINDS.get(kind, ())))
         for seed in seeds_of(given.seeds or f"0:{SEEDS}")
+        for kind in given.map or [""]
         for config, most in chosen
         if given.seeds or seed < most
     ]
@@ -204,7 +238,7 @@ def main() -> None:
         parser.error(f"in MuJoCo there are {', '.join(MUJOCO_SEEDS)} on {' and '.join(IN_C)}")
     if not given.table:
         compute(missing(wanted, read(path)), run_one, lambda rows: keep(path, rows), RUNS)
-    print(in_words(read(path), "elsewhere_" if in_mujoco else ""))
+    print(maps_in_words(read(path)) if given.map else in_words(read(path), "elsewhere_" if in_mujoco else ""))
 
 
 if __name__ == "__main__":

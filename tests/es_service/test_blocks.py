@@ -15,7 +15,7 @@ from es_service.search.algorithms.base import frozen
 from es_service.search.algorithms.common import first_state
 from es_service.search.arrays import problem, read_only, same_rows
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
-from es_service.search.maps.geometry import Cvt
+from es_service.search.maps.geometry import Cvt, Dominated
 from tests.es_service.map_examples import PLANE
 
 ROWS = BLOCK_BYTES // 16
@@ -92,6 +92,8 @@ def test_a_state_is_what_its_blocks_say():
     assert dict(again.search.extra["deep"]["empty"]) == {}
     grid = state_of(stored(state({}, empty_map(PLANE))), 0, 0.0).search.map
     assert (grid.geometry, grid.samples_N) == (PLANE, None)
+    slots = Dominated(PLANE.bounds, PLANE.shape, 9, 2)
+    assert state_of(stored(state({}, empty_map(slots))), 0, 0.0).search.map.geometry == slots
     assert state_of(stored(state()), 0, 0.0).search.map is None
 
 

@@ -21,7 +21,7 @@ from es_service.report.markup import MOST_COLUMNS
 from es_service.report.summary import number
 from es_service.report.write import write_comparison, write_report
 from es_service.runs.run_status import GROUPS, INSIDE, write_groups
-from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.behaviour_map import BehaviourMap, projected
 from tests.database import execute
 from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
@@ -298,7 +298,7 @@ def map_of(run: RunData) -> BehaviourMap:
     return run.map
 
 
-def test_maps_over_seeds_have_the_share_of_the_runs_and_the_median_fitness(runs):
+def test_maps_over_seeds_have_the_share_of_the_runs_and_the_median_fitness(runs, tmp_path):
     maps = [map_of(run) for run in runs[:3]]
     for over in ("share", "median"):
         found = map_of(several_maps.over_seeds(runs[:3], over))
@@ -308,6 +308,11 @@ def test_maps_over_seeds_have_the_share_of_the_runs_and_the_median_fitness(runs)
             assert value == (len(there) / 3 if over == "share" else np.median(there))
             assert found.geometry.cells_of(descriptor_B[None])[0] == cell
         assert set(found.cell_N) == set(np.concatenate([map_.cell_N for map_ in maps]))
+    dominated = read_run(write_run(tmp_path / "slots", {"map.kind": "dominated", "map.slots": 50}))
+    both, shown = map_of(several_maps.over_seeds([runs[0], dominated], "share")), projected(map_of(dominated))
+    assert both.geometry == shown.geometry == maps[0].geometry
+    assert set(both.cell_N) == {*maps[0].cell_N, *shown.cell_N}
+    assert set(both.fitness_N) == {0.5, 1.0}
     with pytest.raises(ValueError, match="do not have the same cells"):
         several_maps.over_seeds([runs[0], replace(runs[1], map=None)], "share")
 
@@ -414,6 +419,19 @@ def test_an_elite_of_a_cvt_map_is_plotted_on_its_side_of_a_wall(tmp_path, axes):
     np.testing.assert_array_equal(plots.behaviour_map(maze, axes).get_offsets(), shown_N_B)
     plain = replace(maze, task=replace(maze.task, walls=None))
     np.testing.assert_array_equal(plots.behaviour_map(plain, axes).get_offsets(), centroid_N_B)
+
+
+def test_elites_of_a_dominated_map_are_plotted_at_their_descriptors(tmp_path, axes):
+    settings = {"map.kind": "dominated", "map.slots": 30}
+    plane, line = (read_run(write_run(tmp_path / str(n), settings, task=task_with(n))) for n in (2, 1))
+    np.testing.assert_array_equal(plots.behaviour_map(plane, axes).get_offsets(), plane.map.descriptor_N_B)
+    drawn = plots.behaviour_map(line, axes).get_offsets()
+    np.testing.assert_array_equal(drawn, np.column_stack([line.map.descriptor_N_B, line.map.fitness_N]))
+    fitness_K = np.array([-200.0, -100.0])
+    expected = [(projected(plane.map).fitness_N >= fitness).sum() / 400 for fitness in fitness_K]
+    np.testing.assert_array_equal(several_maps.profile(plane.map, fitness_K), expected)
+    with pytest.raises(NotInRunError, match="a dominated map, whose earlier elites do not follow"):
+        plots.snapshots(plane, axes.figure)
 
 
 def test_of_two_runs_in_the_middle_the_page_says_that_the_map_is_of_the_lower(runs):

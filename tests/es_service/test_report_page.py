@@ -195,6 +195,22 @@ def test_voronoi_cells_fill_the_map_and_hold_their_centroids(tmp_path):
     assert total == pytest.approx(frame.width * frame.height, rel=1e-3)
 
 
+@pytest.mark.parametrize("dimensions", [1, 2, 3])
+def test_elites_of_a_dominated_map_are_points_at_their_descriptors(tmp_path, dimensions):
+    settings = {"map.kind": "dominated", "map.slots": 30}
+    data = read_run(write_run(tmp_path / "run", settings, task=task_with(dimensions)))
+    figure, text, frame = maps.draw_map(data)
+    assert not maps.has_area(data.map)
+    assert text.startswith("Each point is an elite")
+    points = re.findall(r'<circle cx="([^"]*)" cy="([^"]*)"[^>]* data-c="(\d+)"', str(figure))
+    assert len(points) == 15 * {1: 1, 2: 1, 3: 3}[dimensions]
+    assert [int(slot) for _, _, slot in points[:15]] == data.map.cell_N.tolist()
+    if frame is not None:
+        x_N, y_N = frame.across(data.map.descriptor_N_B[:, 0]), frame.down(data.map.descriptor_N_B[:, 1])
+        assert [point[:2] for point in points] == [(f"{x:.1f}", f"{y:.1f}") for x, y in zip(x_N, y_N, strict=True)]
+    assert "15 of 30 cells" not in page_of(data.folder)
+
+
 @pytest.mark.parametrize("settings", [{"map.enabled": False, "search.algorithm": "es"}, {}])
 def test_generation_0_alone_and_a_run_without_a_map_have_pages(tmp_path, settings):
     page = page_of(write_run(tmp_path / "run", settings, generations=0, filled=0.0))

@@ -54,6 +54,7 @@ CHANGES = {
         "map": {"correct_every": 2, "correct_episodes": 3},
     },
     "memes, elites measured again": {"search": {"algorithm": "memes", "elites": {"kind": "eme"}}},
+    "memes, a dominated map": {"search": {"algorithm": "memes"}, "map": {"kind": "dominated", "slots": 5}},
 }
 """Name -> settings of a run that are none of a method's own."""
 LONG = ("memes, elites measured again",)

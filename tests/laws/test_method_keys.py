@@ -140,6 +140,7 @@ NOT_MEASURED = {
     "search.init_from": "names a folder, of which the functions of a search know nothing",
     "search.candidate_choice": "chooses among the elites of that folder, which `test_polish.py` checks",
     "map.centroids": "is for maps of the kind cvt; `test_geometry.py` has it",
+    **dict.fromkeys(("map.slots", "map.neighbours"), "is for dominated maps; `test_dominated_maps.py` has them"),
     "search.allow_infeasible": "is about results of -inf, which `test_policies.py` has",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
     "task.descriptor": "is for tasks of Python objects; `test_gymnasium.py` has it",

@@ -61,6 +61,12 @@ class GridMap:
         self.elites[index] = elite
         return index
 
+    def offer(self, elites):
+        """Insert elites one after another: of each, the cell of which it is the elite then, or None."""
+        for elite in elites:
+            self.insert(elite)
+        return [next((cell for cell, other in self.elites.items() if other is one), None) for one in elites]
+
 
 def coverage(elites, cells):
     return len(elites) / cells

@@ -9,7 +9,8 @@ from tests.references.novelty_search import novelty
 
 class Memes:
     def __init__(self, centres, map_, learning_rate, l2, *, mode, patience, neighbours, newest):
-        """map_: an empty GridMap; mode: explore, exploit or explore_exploit; patience: generations before a reset."""
+        """map_: an empty GridMap or SlotMap; mode: explore, exploit or explore_exploit; patience: generations until a
+        reset."""
         self.learning_rate, self.l2, self.patience = learning_rate, l2, patience
         self.neighbours, self.newest = neighbours, newest
         self.map, self.archive = map_, []
@@ -44,9 +45,8 @@ class Memes:
         offered = []
         for i, (fitness, descriptor) in enumerate(evaluated):
             offered.append(Elite(fitness, descriptor, generation, math.nan, self.emitters[i].centre, i))
-            self.map.insert(offered[-1])
             self.archive.append(descriptor)
-        mine = [[cell for cell, elite in self.map.elites.items() if elite is one] for one in offered]
-        for i, cells in enumerate(mine):
-            self.useless[i] = 0 if cells else self.useless[i] + 1
-        return [cells[0] if cells else None for cells in mine]
+        mine = self.map.offer(offered)
+        for i, cell in enumerate(mine):
+            self.useless[i] = self.useless[i] + 1 if cell is None else 0
+        return mine

@@ -29,12 +29,13 @@ from es_service.search.algorithms.base import (
     CentreState,
     FitnessWeight,
     SearchState,
+    in_columns,
     with_centre,
 )
 from es_service.search.algorithms.settings import CentresSettings, settings_of
 from es_service.search.arrays import read_only
-from es_service.search.maps.behaviour_map import BehaviourMap, changed, insert
-from es_service.search.maps.geometry import cell_count
+from es_service.search.maps.behaviour_map import BehaviourMap, changed, insert, insert_each
+from es_service.search.maps.geometry import Dominated, cell_count
 from es_service.search.novelty import NoveltyArchive, empty_archive, extended, novelty
 from es_service.search.shaping import pair_weights, utilities, weight_of_fitness, weighted
 from es_service.search.steps import STEPS, fresh_state
@@ -174,9 +175,14 @@ def step_centre(state: SearchState, asked: Ask, gradient_D: FloatArray, search: 
 
 
 def add_to_archive_and_map(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-    """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another."""
+    """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another; in a map
+    of slots they compete at once."""
     for evaluation in evaluations:
-        state = insert_into_map(add_to_archive(state, evaluation), evaluation)
+        state = add_to_archive(state, evaluation)
+    if (map_ := state.map) is not None and isinstance(map_.geometry, Dominated):
+        return _compete(state, map_, evaluations)
+    for evaluation in evaluations:
+        state = insert_into_map(state, evaluation)
     return state
 
 
@@ -218,6 +224,24 @@ def insert_into_map(state: SearchState, evaluation: CentreEvaluation) -> SearchS
     ]
     centres[evaluation.centre] = replace(centre, cell=cell)
     return replace(state, centres=tuple(centres), map=map_)
+
+
+def _compete(state: SearchState, map_: BehaviourMap, evaluations: Sequence[CentreEvaluation]) -> SearchState:
+    """The state after the evaluations of all centres for a map of slots; scores and cells as in `insert_into_map`."""
+    for evaluation in evaluations:
+        cell = state.centres[evaluation.centre].cell
+        if cell != NO_CELL and np.isfinite(evaluation.population_max):
+            map_ = changed(map_, cell, score=evaluation.population_max)
+    told = in_columns(evaluations)
+    valid = told.valid_N
+    columns = told.centre_N[valid], told.population_max_N[valid]
+    map_ = insert_each(
+        map_, told.descriptor_N_B[valid], told.fitness_N[valid], told.generation, *columns, told.episodes
+    )
+    cell_N = map_.cells_with(told.generation, told.centre_N)  # in which EMPTY is NO_CELL
+    for index, cell in zip(told.centre_N.tolist(), cell_N.tolist(), strict=True):
+        state = with_centre(state, index, replace(state.centres[index], cell=cell))
+    return replace(state, map=map_)
 
 
 Starts = Literal["uniform", "novelty", "least_tried", "fitness"]

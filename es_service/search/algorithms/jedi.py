@@ -42,7 +42,7 @@ from es_service.search.algorithms.common import novelty_search, population
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.maps.geometry import cell_count
+from es_service.search.maps.geometry import cell_count, tessellation
 
 TARGET_CHOICE = 5
 """Last id of the random stream of Domain.SELECTION that draws the targets."""
@@ -121,8 +121,9 @@ def jedi(config: RunConfig) -> Algorithm:
             extra[VISITS] = np.zeros_like(extra[VISITS])
         valid = [evaluation.descriptor_B for evaluation in evaluations if evaluation.valid]
         if valid and state.map is not None:
-            cell_N, cells = state.map.geometry.cells_of(np.array(valid)), state.map.geometry.size
-            extra[VISITS] = extra[VISITS] + np.bincount(cell_N, minlength=cells)
+            cells = tessellation(state.map.geometry)
+            cell_N, size = cells.cells_of(np.array(valid)), cells.size
+            extra[VISITS] = extra[VISITS] + np.bincount(cell_N, minlength=size)
         if generation % search.target_generations == 0 and state.map is not None and state.map.size:
             candidate_C_B = promising(state.map, extra[VISITS], search.model_noise)
             key = stream_keys(config.seed, Domain.SELECTION, generation, TARGET_CHOICE)
@@ -156,7 +157,7 @@ def promising(map_: BehaviourMap, visits: NDArray[np.int64], noise: float) -> ND
     """
     rows = _spread(map_.size)
     low_B, high_B = np.array(map_.geometry.bounds, np.float64).T
-    middle_C_B = map_.geometry.middles_of(_spread(map_.geometry.size))
+    middle_C_B = tessellation(map_.geometry).middles_of(_spread(map_.geometry.size))
     mean_C, std_C = predicted(
         (map_.descriptor_N_B[rows] - low_B) / (high_B - low_B),
         map_.fitness_N[rows].astype(np.float64),

@@ -77,6 +77,7 @@ class MapElitesSettings(SearchConfig):
     )
     first_centres = 32
     needs_map = "whose policies descend from elites of the map"
+    map_kinds = ("grid", "cvt", "dominated")
     spread_by = ("search.iso_sigma", "search.line_sigma")
 
     def policies(self) -> int:

@@ -91,6 +91,7 @@ class MeEsSettings(EmittersSettings):
         PresetRow("search.cell_sampling", "top", "score", "literature: QDax, which follows the paper. uber: ME-ES."),
     )
     needs_map = "whose blocks start from elites of the map"
+    map_kinds = ("grid", "cvt", "dominated")
 
 
 @method(MeEsSettings)

@@ -38,6 +38,7 @@ from es_service.search.algorithms.common import add_to_archive, add_to_archive_a
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.arrays import read_only
 from es_service.search.maps.behaviour_map import EMPTY
+from es_service.search.maps.geometry import tessellation
 from es_service.search.maps.kept import (
     COLUMNS,
     KeptPolicies,
@@ -131,7 +132,8 @@ def told_of_samples(
     kept = _with_new_samples(kept, told, rows_R[is_valid_R], again_R[is_valid_R], samples)
     comes_K = np.zeros(kept.size, bool)
     comes_K[rows_R[is_valid_R]] = True
-    comes_K &= state.map.geometry.cells_of(kept.descriptor_K_B) != kept.cell_K
+    cells = tessellation(state.map.geometry)
+    comes_K &= cells.cells_of(kept.descriptor_K_B) != kept.cell_K
     stays_K = ~comes_K
     stays_K[rows_R[~is_valid_R]] = False
     new_N_S = new_N_S[told.valid_N[new_N_S].all(axis=1)]
@@ -142,7 +144,7 @@ def told_of_samples(
     how = settings.replaces if isinstance(settings, MeasuredNewcomers) else "worst"
     key = stream_keys(config.seed, Domain.SELECTION, told.generation, PLACE_CHOICE)
     uniform_K = uniforms(key, np.arange(resident.size, dtype=np.uint32)) if how == "any" else None
-    kept = put(resident, coming, state.map.geometry, settings.depth, how, uniform_K)
+    kept = put(resident, coming, cells, settings.depth, how, uniform_K)
     entered = np.flatnonzero(np.isin(new.serial_K, kept.serial_K))
     at_new = np.isin(kept.serial_K, new.serial_K)
     first_N = new_N_S[np.searchsorted(new.serial_K, kept.serial_K[at_new]), 0]

@@ -90,6 +90,7 @@ class MemesSettings(EmittersSettings):
         same("novelty.newest", 50_000, "the code of MEMES, whose novelty archive keeps no more"),
     )
     needs_map = "whose emitters begin again from elites of the map"
+    map_kinds = ("grid", "cvt", "dominated")
 
 
 @method(MemesSettings)

@@ -1,11 +1,12 @@
 """The behaviour map as the driver keeps it in memory: fitness, descriptor and origin of each cell's elite.
 
-An elite is the evaluated centre or policy with the highest fitness among all whose descriptor is in a cell. An entry
+An elite is the evaluated centre or policy with the highest fitness among all whose descriptor is in a cell. A map of
+slots (`map.kind: dominated`) has other elites: `maps/dominated.py` says which, and its cells are the slots. An entry
 names its policy and the trace of one of its episodes, which are in the run store. Most searches only insert; one that
 measures its elites again may also change, move and remove entries. All functions are pure.
 
-Axes: N filled cells, in the order in which they were filled; B descriptor dimensions; D policy parameters; O
-observation; T points of a trace; Q evaluated centres of a batch.
+Axes: N filled cells, in the order in which they were filled, and slots in that in which their elites entered; B
+descriptor dimensions; D policy parameters; O observation; T points of a trace; Q evaluated centres of a batch.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from es_service.protocol.content import NAME, Policy
 from es_service.protocol.messages import FloatArray
-from es_service.search.maps.geometry import Geometry
+from es_service.search.maps.dominated import survivors
+from es_service.search.maps.geometry import Dominated, Geometry, Tessellation, tessellation
 
 COLUMNS: dict[str, Any] = {
     **{"fitness_N": "f8", "descriptor_N_B": "f8", "generation_N": "i8", "centre_N": "i8", "score_N": "f8"},
@@ -110,7 +112,7 @@ def insert(
     """Insert an evaluated centre if it is better than its cell's elite: (new map, cell, whether it was inserted).
 
     It is inserted if the cell was empty or the fitness of the present elite is strictly lower; if they are equal, the
-    present elite stays.
+    present elite stays. Not for slots, which have no places: see `insert_each`.
 
     Args:
         descriptor_B: mean descriptor, finite.
@@ -118,7 +120,7 @@ def insert(
         score: see `BehaviourMap.score_N`.
         samples: number of the evaluation episodes; not used by a map that does not count them.
     """
-    cell = int(map_.geometry.cells_of(descriptor_B[None])[0])
+    cell = int(_with_places(map_.geometry).cells_of(descriptor_B[None])[0])
     entry = {
         "fitness_N": fitness,
         "descriptor_N_B": descriptor_B,
@@ -169,7 +171,7 @@ def moved(map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64]) -> t
     Raises:
         KeyError: the cell is empty.
     """
-    row, to = map_.row_of(cell), int(map_.geometry.cells_of(descriptor_B[None])[0])
+    row, to = map_.row_of(cell), int(_with_places(map_.geometry).cells_of(descriptor_B[None])[0])
     if row is None:
         raise KeyError(cell)
     if to == cell:
@@ -210,11 +212,12 @@ def map_statistics(
     """Coverage, best fitness and QD-score of a map, by history column.
 
     The QD-score is the sum of fitness - qd_offset over all elites. It is summed exactly and rounded once, so that the
-    order of the cells does not matter.
+    order of the cells does not matter. Of a map of slots, all of this is said of its projection; see `projected`.
 
     Args:
         reachable: whether each cell can be reached, [cells]; None if this is unknown.
     """
+    map_ = projected(map_)
     filled = map_.size
     return {
         "map_cells": filled,
@@ -223,6 +226,26 @@ def map_statistics(
         "map_fitness_max": float(map_.fitness_N.max()) if filled else None,
         "qd_score": math.fsum((map_.fitness_N - qd_offset).tolist()),
     }
+
+
+def places_of(map_: BehaviourMap) -> NDArray[np.int64]:
+    """Cell of the descriptor space in which each elite is, [N]: its own or, of a slot, that of `tessellation`."""
+    cells = tessellation(map_.geometry)
+    return map_.cell_N if cells is map_.geometry else cells.cells_of(map_.descriptor_N_B)
+
+
+def projected(map_: BehaviourMap) -> BehaviourMap:
+    """The map by whose cells coverage is counted, which can be compared with others: the fittest elite at each place.
+
+    It is the map itself, unless this has slots. Of equally fit elites the oldest is shown. Source: the released code
+    of Bahlous-Boldi et al. 2025 (arXiv:2502.00593) measures coverage and QD-score so.
+    """
+    place_N = places_of(map_)
+    if place_N is map_.cell_N:
+        return map_
+    rows = np.sort(_fittest(place_N, map_.fitness_N))
+    columns = {name: values[rows] for name, values in columns_of(map_).items()}
+    return replace(map_, geometry=tessellation(map_.geometry), **columns | {"cell_N": place_N[rows]})
 
 
 def with_names(
@@ -263,6 +286,19 @@ def columns_of(map_: BehaviourMap) -> dict[str, np.ndarray]:
     return {"cell_N": map_.cell_N, **{name: getattr(map_, name) for name in COLUMNS}, **samples}
 
 
+def _with_places(geometry: Geometry) -> Tessellation:
+    """A geometry whose cells have places. Raises ValueError for one of slots."""
+    if isinstance(geometry, Dominated):
+        raise ValueError("the slots of a dominated map have no places; offer a whole generation by `insert_each`")
+    return geometry
+
+
+def _fittest(cell_Q: NDArray[np.int64], fitness_Q: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index of the fittest in each cell, the first of equally fit ones, by cell."""
+    fittest = np.lexsort((-fitness_Q, cell_Q))  # stable: of equally fit ones the first comes first
+    return fittest[np.flatnonzero(np.diff(cell_Q[fittest], prepend=EMPTY))]
+
+
 def _offered(map_: BehaviourMap, cell: int, entry: dict[str, Any]) -> tuple[BehaviourMap, int, bool]:
     """Insert an entry into a cell unless the elite there is as fit; see `insert`."""
     row = map_.row_of(cell)
@@ -295,14 +331,27 @@ def insert_each(
 ) -> BehaviourMap:
     """The map after `insert` of each evaluated centre, one after another.
 
+    For slots, all of them compete with the elites at once, as `maps/dominated.py` says. An elite that stays keeps its
+    slot; those that enter take the free ones, the first the lowest.
+
     Args:
         descriptor_Q_B: mean descriptor of each, finite.
         fitness_Q: mean fitness of each, finite.
         samples: number of each one's evaluation episodes; not used by a map that does not count them.
     """
+    given_Q = {
+        "fitness_N": fitness_Q,
+        "descriptor_N_B": descriptor_Q_B,
+        "generation_N": np.full(fitness_Q.shape, generation),
+        "centre_N": centre_Q,
+        "score_N": score_Q,
+        **dict.fromkeys(("policy_N", "trace_N"), np.zeros(fitness_Q.shape, NAME)),
+        "samples_N": np.full(fitness_Q.shape, samples),
+    }
+    if isinstance(map_.geometry, Dominated):
+        return _into_slots(map_, map_.geometry, given_Q)
     cell_Q = map_.geometry.cells_of(descriptor_Q_B)
-    fittest = np.lexsort((-fitness_Q, cell_Q))  # stable: of equally fit ones the first comes first
-    fittest = fittest[np.flatnonzero(np.diff(cell_Q[fittest], prepend=EMPTY))]
+    fittest = _fittest(cell_Q, fitness_Q)
     sorted_rows = np.argsort(map_.cell_N)
     position = np.searchsorted(map_.cell_N, cell_Q[fittest], sorter=sorted_rows)
     row = np.append(sorted_rows, -1)[position]
@@ -311,20 +360,25 @@ def insert_each(
     # A cell was filled by the first one in it, which is not the fittest.
     filled_by = np.unique(cell_Q, return_index=True)[1][~is_filled]
     filling = fittest[~is_filled][np.argsort(filled_by)]
-    given_Q = {
-        "cell_N": cell_Q,
-        "fitness_N": fitness_Q,
-        "descriptor_N_B": descriptor_Q_B,
-        "generation_N": np.full(cell_Q.shape, generation),
-        "centre_N": centre_Q,
-        "score_N": score_Q,
-        **dict.fromkeys(("policy_N", "trace_N"), np.zeros(cell_Q.shape, NAME)),
-        "samples_N": np.full(cell_Q.shape, samples),
-    }
+    given_Q["cell_N"] = cell_Q
     if not is_better.any() and not filling.size:
         return map_
     columns = {}
     for name, values in columns_of(map_).items():
         columns[name] = np.concatenate([values, given_Q[name][filling].astype(values.dtype)])
         columns[name][row[is_better]] = given_Q[name][fittest[is_better]]
+    return replace(map_, **columns)
+
+
+def _into_slots(map_: BehaviourMap, geometry: Dominated, given_Q: dict[str, np.ndarray]) -> BehaviourMap:
+    """The map of the elites and the newcomers that stay; see `insert_each`."""
+    given_Q["cell_N"] = np.full(given_Q["fitness_N"].shape, EMPTY)
+    both = {name: np.concatenate([was, given_Q[name].astype(was.dtype)]) for name, was in columns_of(map_).items()}
+    rows = survivors(both["descriptor_N_B"], both["fitness_N"], geometry.neighbours, geometry.slots)
+    columns = {name: values[rows] for name, values in both.items()}
+    is_new = columns["cell_N"] == EMPTY
+    if not is_new.any():
+        return map_
+    free = np.setdiff1d(np.arange(geometry.slots), columns["cell_N"][~is_new])
+    columns["cell_N"][is_new] = free[: int(is_new.sum())]
     return replace(map_, **columns)

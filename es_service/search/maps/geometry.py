@@ -1,4 +1,4 @@
-"""Division of the descriptor space into cells: a regular grid, or the Voronoi cells of evenly spread centroids.
+"""Cells of a map: a regular grid, the Voronoi cells of evenly spread centroids, or slots that have no place.
 
 Descriptors outside the bounds belong to a cell at the border. All computation is in float64 and written so that equal
 descriptors fall into the same cell on every machine. The positions of a cvt's centroids may depend on the machine, so
@@ -130,10 +130,49 @@ class Cvt:
         return index[0] if len(index) == 1 and 0 <= index[0] < self.size else None
 
 
-Geometry = Grid | Cvt
+@dataclass(frozen=True)
+class Dominated:
+    """Slots without a place, whose elites hold out against fitter ones nearby: `maps/dominated.py` says which stay.
+
+    A grid, which has no effect on them, only counts which part of the descriptor space they cover.
+    """
+
+    bounds: Bounds
+    grid_shape: tuple[int, ...]
+    """Cells of that grid along each dimension."""
+    slots: int
+    """Number of elites at most."""
+    neighbours: int
+    """Number of fitter elites from which a distance is measured."""
+
+    @property
+    def size(self) -> int:
+        return self.slots
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of slots, as for a grid with one dimension."""
+        return (self.slots,)
+
+    def index_of(self, cell: int) -> tuple[int, ...]:
+        """The slot's number, as an index with one element."""
+        return (cell,)
+
+    def cell_at(self, index: tuple[int, ...]) -> int | None:
+        """Inverse of `index_of`; None if there is no such slot."""
+        return index[0] if len(index) == 1 and 0 <= index[0] < self.slots else None
 
 
-def intervals(geometry: Geometry) -> NDArray[np.float64]:
+Tessellation = Grid | Cvt
+Geometry = Grid | Cvt | Dominated
+
+
+def tessellation(geometry: Geometry) -> Tessellation:
+    """The cells of the descriptor space by which coverage is counted: those of the map or, of slots, their grid."""
+    return Grid(geometry.bounds, geometry.grid_shape) if isinstance(geometry, Dominated) else geometry
+
+
+def intervals(geometry: Tessellation) -> NDArray[np.float64]:
     """(low, high) of each cell of a map of one dimension, [C, 2]."""
     if isinstance(geometry, Grid):
         edges = geometry.edges[0]
@@ -152,10 +191,12 @@ def make_geometry(config: MapConfig) -> Geometry:
     """The cells that a config specifies; they are the same for every seed, so that runs can be compared by cell."""
     if config.kind == "grid":
         return Grid(config.bounds, config.cells)
+    if config.kind == "dominated":
+        return Dominated(config.bounds, config.cells, config.slots, config.neighbours)
     return Cvt(config.bounds, _centroids(config.bounds, config.cells[0], config.centroids))
 
 
-def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | None:
+def reachable_cells(geometry: Tessellation, task: TaskSpec) -> NDArray[np.bool_] | None:
     """Whether each cell contains a place where an episode can end, [cells]; None if this is unknown.
 
     A place cannot be reached if it is nearer to the middle of a wall than `task.wall_clearance`, or outside the task's

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.content import NAME
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.maps.geometry import Geometry
+from es_service.search.maps.geometry import Tessellation
 
 Draw = Literal["exponential", "linear", "harmonic", "uniform"]
 Replace = Literal["worst", "any"]
@@ -152,7 +152,7 @@ def with_means(
 def put(
     resident: KeptPolicies,
     coming: KeptPolicies,
-    geometry: Geometry,
+    geometry: Tessellation,
     depth: int,
     how: Replace = "worst",
     uniform_K: NDArray[np.floating] | None = None,
