@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.text import unknown_name
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.machine import given_path
 from es_service.report import between, compare, maps, statistics
@@ -193,10 +194,12 @@ def curves(
     for data in all_data:
         if not data.history["generation"].size:
             raise NotInRunError(f"{data.folder} has no finished generation yet", run=data.folder)
-    places = [name for name in X_AXES if all(name in axes_of(data.history) for data in all_data)]
-    for name, allowed in ((column, all_data[0].history), (against, places)):
-        if name not in allowed or any(column not in data.history for data in all_data):
-            raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
+    allowed = [name for name in X_AXES if all(name in axes_of(data.history) for data in all_data)]
+    if against not in allowed:
+        raise unknown_name("axis", against, allowed, "against")
+    if any(column not in data.history for data in all_data):
+        of_first = ", ".join(all_data[0].history)
+        raise ConfigError(f"{column} is no history column of all runs", value=column, allowed=of_first)
     groups = compare.grouped(all_data, group_by)
     x_K = compare.places(groups, against)
     for index, group in enumerate(groups):

@@ -289,7 +289,7 @@ def test_figures_of_chosen_metrics_have_names_that_are_no_paths(runs, tmp_path):
     assert "best_fitness" not in names
     with pytest.raises(ConfigError, match=r"the measure coverge is unknown; must be .*; did you mean coverage"):
         write_figures(runs, tmp_path / "figures", metrics=["coverge"])
-    with pytest.raises(ConfigError, match="hours is no history column of all runs"):
+    with pytest.raises(ConfigError, match=r"the axis hours is unknown; must be .*wall_clock_s"):
         write_figures(runs, tmp_path / "figures", metrics=["coverage"], against="hours")
 
 
