@@ -265,6 +265,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     algorithms = _table("algorithms (search.algorithm)")
     for name, method in ALGORITHMS.items():
         algorithms.add_row(name, method.summary)
+    algorithms.add_row("evosax:NAME", "An optimiser of evosax, such as evosax:CMA_ES; see configs/own_searches.md.")
     algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/method.py.")
     console.print(algorithms)
 

@@ -83,10 +83,13 @@ def parts_of(settings: type[SearchConfig]) -> dict[str, dict[str, type[Section]]
 
 @cache
 def search_fields(settings: type[SearchConfig]) -> dict[str, FieldInfo]:
-    """Dotted key -> field of each key that a method has, for parts those of every kind."""
+    """Dotted key -> field of each key that a method has, for parts those of every kind, and for a group those in it."""
     fields: dict[str, FieldInfo] = {}
     for name, field in settings.model_fields.items():
         key = f"search.{name}"
+        if isinstance(group := field.annotation, type) and issubclass(group, Section):
+            fields |= {f"{key}.{leaf}": its for leaf, its in group.model_fields.items()}
+            continue
         kinds = parts_of(settings).get(key)
         if kinds is None:
             fields[key] = field
@@ -177,6 +180,8 @@ def key_problems(
             return problem_of(key, value, f"{what} (a key of kind {one_of(kinds_with(key, settings))})")
         if key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2:
             return None
+        if settings and key.startswith(SEARCH_OPTIONS) and "options" in settings.model_fields:
+            return unknown_option(key, value, str(given["search.algorithm"]), settings)
         if key in RENAMED or key.startswith(SEARCH_OPTIONS):
             now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
             return problem_of(key, value, f"this key is now {now}", suggestion=now)
@@ -196,6 +201,15 @@ def key_problems(
         return unknown
 
     return {key: found for key, value in given.items() if (found := problem(key, value))}
+
+
+def unknown_option(key: str, value: Any, method: str, settings: type[SearchConfig]) -> Problem:
+    """The problem of a key in `search.options` that a method with options does not have."""
+    options = [_leaf(known) for known in search_fields(settings) if known.startswith(SEARCH_OPTIONS)]
+    meant = nearest(_leaf(key), options)
+    hint = f"; did you mean {meant}?" if meant else ""
+    what = f"unknown option; {method} has {one_of(options, 'and') if options else 'none'}{hint}"
+    return problem_of(key, value, what, suggestion=meant and f"{SEARCH_OPTIONS}{meant}")
 
 
 def unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:

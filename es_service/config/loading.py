@@ -230,9 +230,11 @@ def _chosen(
             sentence = f"{show(given)} is not a known {what}; must be {allowed}{hint}"
             problems.append(problem_of(key, given, sentence, suggestion=meant, allowed=allowed))
         except ConfigError as error:
+            if error.ways_out:  # what is not installed, without which its keys are not known
+                raise
             where = error.field or key
             sentence = str(error) if error.field else f"{key}: {error}"
-            problems.append(Problem(sentence, where, chosen.get(where)))
+            problems.append(Problem(sentence, where, chosen.get(where), suggestion=error.suggestion))
     task, method = found
     return task, None if method is None else method.settings, problems
 

@@ -84,7 +84,10 @@ def preset_table(algorithms: Mapping[str, Any]) -> list[PresetRow]:
 class SearchConfig(Section):
     """The search. Constants of the run."""
 
-    algorithm: Text = Field(description="Name of the method: a shipped one, or `module:function` for one of your own.")
+    algorithm: Text = Field(
+        description="Name of the method: a shipped one, `evosax:NAME` for an optimiser of evosax, or "
+        "`module:function` for one of your own."
+    )
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )

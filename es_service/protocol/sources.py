@@ -38,6 +38,9 @@ PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
 SUITES = ("gymnax", "playground")
 """Packages of environments in JAX, such as `gymnax:CartPole-v1`, by their names on the package index."""
+VERSIONED = {**{suite: (suite,) for suite in SUITES}, "evosax": ("evosax", "optax")}
+"""Kind of the names of tasks, and of searches such as `evosax:CMA_ES`, that a library defines -> packages whose
+versions are recorded in the place of the hashes of their files."""
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""
 MODELS, MODEL_FILES = "mujoco", "envs/mujoco/assets"
@@ -90,9 +93,9 @@ def user_sources(*names: str) -> dict[str, str]:
                 sources[LIBRARY] = metadata.version(LIBRARY)
         if name.startswith(f"{MODELS}:"):
             sources |= _models()
-        if (suite := name.partition(":")[0]) in SUITES:
+        for package in VERSIONED.get(name.partition(":")[0], ()):
             with suppress(metadata.PackageNotFoundError):
-                sources[suite] = metadata.version(suite)
+                sources[package] = metadata.version(package)
     return sources
 
 
@@ -143,13 +146,13 @@ def why_refused(expected: Sources, names: Sequence[str], platform: str = "any") 
 def user_path(name: str) -> str:
     """The code of a user that a name in a config means, as `package.module:name`; empty if it means none.
 
-    `brax:NAME`, `mujoco:ID` and `SUITE:NAME` are none. What is simulated by Python has the kind of the task before the
-    path, as in `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module
-    that registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace; ours, as
-    in `gymnasium:es_service/AntMazeMujoco-v0`, are none.
+    `brax:NAME`, `mujoco:ID`, `SUITE:NAME` and `evosax:NAME` are none. What is simulated by Python has the kind of the
+    task before the path, as in `python:package.module:Class`. An environment of Gymnasium is the user's if it is named
+    with the module that registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its
+    namespace; ours, as in `gymnasium:es_service/AntMazeMujoco-v0`, are none.
     """
     kind, colon, rest = name.partition(":")
-    if kind in ("brax", "mujoco", *SUITES):
+    if kind in ("brax", "mujoco", *VERSIONED):
         return ""
     if kind == LIBRARY:
         module, separator, environment = rest.partition(":" if ":" in rest else "/")

@@ -14,6 +14,7 @@ import pkgutil
 from collections.abc import Iterator, Mapping
 
 from es_service.config.search import PopulationConfig
+from es_service.search.algorithms import evosax
 from es_service.search.algorithms.method import Method, user_method
 
 
@@ -38,11 +39,15 @@ OURS: dict[str, Method] = {method.name: method for method in sorted(_shipped(), 
 
 
 class Algorithms(Mapping[str, Method]):
-    """Methods by name. Iteration yields the shipped ones; lookup also finds `package.module:function`."""
+    """Methods by name. Iteration yields the shipped ones; lookup also finds `package.module:function`, and the
+    optimisers of a library by `evosax:NAME`."""
 
     def __getitem__(self, name: str) -> Method:
-        """Raises KeyError for a plain name that is not shipped, ConfigError for a function that cannot be used."""
-        return user_method(name) if ":" in name else OURS[name]
+        """Raises KeyError for a plain name that is not shipped, ConfigError for what cannot be used."""
+        kind, colon, rest = name.partition(":")
+        if kind == evosax.LIBRARY and colon:
+            return evosax.named(rest)
+        return user_method(name) if colon else OURS[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(OURS)
