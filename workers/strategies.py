@@ -178,13 +178,15 @@ def _key(seed: int, generation: int) -> Any:
 
 def form(settings: Settings) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Name of each array of the state -> its type and shape."""
-    return {name: (str(leaf.dtype), leaf.shape) for name, leaf in _leaves(_state_form(strategy(settings))).items()}
+    return {name: (str(leaf.dtype), leaf.shape) for name, leaf in _leaves(_state_form(settings)).items()}
 
 
-def _state_form(made: Strategy) -> Any:
+@lru_cache(maxsize=8)
+def _state_form(settings: Settings) -> Any:
     """A state without values."""
     import jax
 
+    made = strategy(settings)
     algorithm, mean_D = made.algorithm, np.zeros(made.algorithm.num_dims, np.float32)
     key = _key(0, 0)
     if made.has_population:
@@ -222,7 +224,7 @@ def _state(settings: Settings, arrays: Arrays) -> Any:
             f"the stored state of evosax:{settings.name} does not fit: its {first} is {was}, and must be {now} for "
             f"evosax {metadata.version('evosax')}, {settings.members} members and {settings.parameters} parameters"
         )
-    return tree_unflatten(tree_structure(_state_form(strategy(settings))), [arrays[name] for name in expected])
+    return tree_unflatten(tree_structure(_state_form(settings)), [arrays[name] for name in expected])
 
 
 def _in_words(form: tuple[str, tuple[int, ...]] | None) -> str:

@@ -171,6 +171,7 @@ def key_problems(
     """
     known = FIELDS | (search_fields(settings) if settings else all_search_fields(algorithms))
     parts = {part for method in algorithms.values() for part in parts_of(method.settings)}
+    parts |= {key.rpartition(".")[0] for key in known if key.startswith("search.") and key.count(".") == 2}
 
     def problem(key: str, value: Any) -> Problem | None:
         if key in known:

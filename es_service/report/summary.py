@@ -24,8 +24,7 @@ from es_service.runs.certified import Certified, failed_sentence, measure_of, pa
 from es_service.runs.identity import code_changes
 from es_service.runs.run_status import invalid_members, objectives, population_size, state, weights
 from es_service.runs.selection import RankedBy
-from es_service.search.algorithms import OURS
-from es_service.search.algorithms.settings import UndeclaredSettings
+from es_service.search.algorithms import known_settings
 from es_service.search.maps.behaviour_map import projected
 
 
@@ -273,7 +272,7 @@ def changed_settings(config: Mapping[str, Any], task: TaskSpec) -> list[Setting]
     values = flat(config)
     shown = {key: value for key, value in values.items() if not key.startswith(SHOWN_ELSEWHERE)}
     environment, algorithm = values["task.environment"], values["search.algorithm"]
-    method = OURS.get(algorithm, _Keys(UndeclaredSettings))  # a search of the user is not imported
+    method = _Keys(known_settings(algorithm))
     is_unknown = {key: key.startswith("search.") and key not in search_fields(method.settings) for key in shown}
     known = {key: value for key, value in values.items() if ":" not in algorithm or not is_unknown.get(key)}
     reading = read(nested(known), {}, Known({environment: task}, {algorithm: method}, ROLLOUTS), new=False)
@@ -282,7 +281,8 @@ def changed_settings(config: Mapping[str, Any], task: TaskSpec) -> list[Setting]
         others = {name: other for name, other in reading.values.given.items() if name != key}
         default = _NONE if reading.problems else reading.values.of(others).get(key, _NONE)
         if default is _NONE:
-            changed.append(Setting(key, in_line(value), ""))
+            if value is not None:
+                changed.append(Setting(key, in_line(value), ""))
         elif _plain(default) != _plain(value) and not (key == "map.bounds" and default is None):  # which have none
             changed.append(Setting(key, in_line(value), in_line(default)))
     return changed

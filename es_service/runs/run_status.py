@@ -68,7 +68,7 @@ class RunStatus:
 
 def population_size(constants: Mapping[str, Any]) -> str:
     """The size of a generation's populations, or of its batch of policies, in words; empty if it is not known."""
-    sizes = {"search.pairs": "pairs", "search.batch": "policies"}
+    sizes = {"search.pairs": "pairs", "search.batch": "policies", "search.population_size": "members"}
     return next((f"{constants[key]:,} {unit}" for key, unit in sizes.items() if key in constants), "")
 
 

@@ -13,9 +13,10 @@ import importlib
 import pkgutil
 from collections.abc import Iterator, Mapping
 
-from es_service.config.search import PopulationConfig
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.search.algorithms import evosax
 from es_service.search.algorithms.method import Method, user_method
+from es_service.search.algorithms.settings import UndeclaredSettings
 
 
 def _shipped() -> Iterator[Method]:
@@ -57,3 +58,10 @@ class Algorithms(Mapping[str, Method]):
 
 
 ALGORITHMS = Algorithms()
+
+
+def known_settings(name: str) -> type[SearchConfig]:
+    """The settings of a method as far as they are known without importing what is none of ours."""
+    if name.startswith(f"{evosax.LIBRARY}:"):
+        return evosax.EvosaxSettings
+    return OURS[name].settings if name in OURS else UndeclaredSettings

@@ -129,7 +129,10 @@ def named(name: str) -> Method:
             value=f"{LIBRARY}:{name}",
             suggestion=near and f"{LIBRARY}:{near}",
         )
-    about = _answer("describe", name)
+    try:
+        about = _answer("describe", name)
+    except _RefusedError as error:
+        raise ConfigError(str(error), value=f"{LIBRARY}:{name}") from error
     fields: dict[str, Any] = {
         option: _field(TYPES[kind], default) for option, (kind, default) in sorted(about["options"].items())
     }
