@@ -173,7 +173,11 @@ def key_problems(
     parts = {part for method in algorithms.values() for part in parts_of(method.settings)}
     parts |= {key.rpartition(".")[0] for key in known if key.startswith("search.") and key.count(".") == 2}
 
+    is_foreign = settings is None and ":" in str(given.get("search.algorithm"))
+
     def problem(key: str, value: Any) -> Problem | None:
+        if is_foreign and key.startswith("search."):
+            return None  # its keys are not known, since it could not be found
         if key in known:
             if not settings or not lacks(key, kind := values.get(kind_of(key)), settings):
                 return None

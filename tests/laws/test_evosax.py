@@ -16,7 +16,7 @@ import pytest
 
 from es_service import api
 from es_service.config.text import parse_value
-from es_service.errors import ConfigError, EvaluationError
+from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.report.write import write_report
 from es_service.runs.certification import certify_run
 from es_service.runs.checked_config import changed_config
@@ -185,7 +185,7 @@ def test_a_state_of_another_form_is_refused_with_what_differs():
     [
         ("CMA_ES", {}),
         ("Open_ES", {"population_size": 64, "options": {"optimizer": "adam", "learning_rate": 0.05}}),
-        ("SNES", {"options": {"optimizer": "sgd", "learning_rate": 1.0}}),
+        ("SNES", {"population_size": 24, "options": {"optimizer": "sgd", "learning_rate": 1.0}}),
         ("PSO", {"population_size": 32, "sigma": 0.5}),
     ],
 )
@@ -194,7 +194,7 @@ def test_they_climb_the_hill(tmp_path, name, search):
         run = api.run(config_of(name, generations=60, **{"sigma": 0.2, **search}), tmp_path / "run").run
     assert run.history.best_fitness.iloc[-1] > 9.95
     np.testing.assert_allclose(list(run.parameters("best").values()), [3.0, 0.2, 0.0], atol=0.25)
-    assert run.history.best_fitness.iloc[0] < -40.0
+    assert run.history.best_fitness.iloc[0] < -39.0
     if name == "CMA_ES":
         sigma = run.history.metric_sigma.to_numpy()
         assert np.isnan(sigma[0])
@@ -211,9 +211,21 @@ def test_a_run_goes_on_where_it_was_with_the_same_bits(tmp_path, name):
         assert api.resume(tmp_path / "parts", ["budget.generations=7"]).run.digest() == whole.digest()
         forked = api.fork(tmp_path / "parts", ["budget.generations=7"], generation=6, out=tmp_path / "fork").run
         assert forked.digest() == whole.digest()
-        other = api.fork(tmp_path / "parts", ["search.population_size=10"], generation=6, out=tmp_path / "other")
-        assert other.run.history.env_steps.diff().iloc[-1] == 20
+        fewer = {"overrides": ["search.population_size=10"], "generation": 6, "out": tmp_path / "fewer"}
+        if name == "CMA_ES":
+            assert api.fork(tmp_path / "parts", **fewer).run.history.env_steps.diff().iloc[-1] == 20
+        else:
+            with pytest.raises(EvaluationError, match=r"its fitness is float32 \(12,\), and must be float32 \(10,\)"):
+                api.fork(tmp_path / "parts", **fewer)
     assert whole.history.env_steps.iloc[-1] == 2 + 7 * 12 * 2
+
+
+def generation_of(folder):
+    """The newest generation of a run that another process may just begin; 0 for none."""
+    try:
+        return api.open_run(folder).generation or 0
+    except StoreError:
+        return 0
 
 
 @pytest.mark.slow
@@ -228,12 +240,10 @@ def test_one_and_two_workers_and_a_killed_driver_give_the_same_bits(tmp_path):
         deadline = time.monotonic() + 300
         while time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.05)
-            if (tmp_path / "killed" / "run.db").exists() and (api.open_run(tmp_path / "killed").generation or 0) >= 2:
+            if generation_of(tmp_path / "killed") >= 2:
                 break
         process.send_signal(signal.SIGKILL)
-    killed = api.open_run(tmp_path / "killed").generation
-    assert killed is not None
-    longest = max(40, killed + 3)
+    longest = max(40, generation_of(tmp_path / "killed") + 3)
     resumed = api.resume(tmp_path / "killed", [f"budget.generations={longest}"]).run
     if longest > 40:
         whole = api.resume(tmp_path / "one", [f"budget.generations={longest}"]).run
@@ -291,7 +301,7 @@ def problems(source, *overrides):
             "search.algorithm=evosax:OpenES",
             "search.algorithm: evosax has no algorithm OpenES; did you mean evosax:Open_ES?",
         ),
-        ("search.algorithm=evosax:", "search.algorithm: evosax has no algorithm ; it has ARS, "),
+        ("search.algorithm=evosax:zz", "search.algorithm: evosax has no algorithm zz; it has ARS, "),
         ("search.algorithm=evosax:RandomSearch", "evosax:RandomSearch needs sampling_fn, which no config can give"),
         (
             "search.options.c_men=1",
@@ -299,14 +309,17 @@ def problems(source, *overrides):
         ),
         ("search.options.c_men=1", "did you mean c_mean?"),
         ("search.options.c_mean=fast", "search.options.c_mean: fast is not allowed; must be a number"),
-        ("search.options=3", "search.options"),
+        (
+            "search.options=3",
+            "search.options: this is a section; set its keys one by one, such as search.options.c_1=...",
+        ),
         ("search.sigma=0", "search.sigma: 0 is not allowed; must be a number above 0"),
         ("search.pairs=4", "search.pairs: 4 has no effect with evosax:CMA_ES; leave it out (a key of "),
         ("map.enabled=true", "map.enabled: true has no effect with evosax:CMA_ES; leave it out"),
         ("map.cells=[5, 5]", "map.cells: [5, 5] has no effect with evosax:CMA_ES; leave it out"),
         ("novelty.neighbours=3", "novelty.neighbours: 3 has no effect with evosax:CMA_ES; leave it out"),
-        ("policy.observation_normalization=true", "policy.observation_normalization"),
-        ("search.centres=2", "search.centres: 2 is not allowed; must be 1 or auto"),
+        ("policy.observation_normalization=true", "which has no training episodes to gather statistics from"),
+        ("search.centres=2", "search.centres: 2 is not allowed for evosax:CMA_ES, which has one centre; must be 1"),
     ],
 )
 def test_what_it_cannot_have_is_refused_with_what_is_allowed(given, message):
@@ -321,9 +334,10 @@ def test_settings_that_evosax_refuses_are_refused_before_a_run():
     assert "evosax:Open_ES refuses 7 members, 3 parameters and these options: Population size must be even" in found
     (found,) = problems(config_of("Open_ES", options={"learning_rate": 0.1}))
     assert "optimizer and learning_rate belong together" in found
-    (found,) = problems(config_of("Open_ES", options={"optimizer": "adan", "learning_rate": 0.1}))
-    assert "did you mean adam?" in found
-    assert "GradientlessDescent" in problems(config_of("GradientlessDescent", sigma=0.3))[0]
+    found, _ = problems(config_of("Open_ES", options={"optimizer": "adan", "learning_rate": 0.1}))
+    assert "optimizer: adan is not allowed; must be adam, adamw, clipup, rmsprop or sgd or null" in found
+    (found,) = problems(config_of("GradientlessDescent", sigma=0.3))
+    assert found.startswith("search.sigma: 0.3 has no effect with evosax:GradientlessDescent; leave it out")
 
 
 @pytest.mark.slow
