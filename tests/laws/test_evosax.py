@@ -169,8 +169,8 @@ def test_a_state_of_another_form_is_refused_with_what_differs():
             renamed,
             r"its C is missing, and must be float32 \(3, 3\) for evosax 0\.\d+\.\d+, 12 members and 3 parameters",
         ),
-        (stored[evosax.STATE] | {"mean": np.zeros(4, np.float32)}, r"its mean is float32 \(4,\), and must be"),
-        (stored[evosax.STATE] | {"std": np.zeros(())}, r"its std is float64 \(\), and must be float32 \(\)"),
+        ({**stored[evosax.STATE], "mean": np.zeros(4, np.float32)}, r"its mean is float32 \(4,\), and must be"),
+        ({**stored[evosax.STATE], "std": np.zeros(())}, r"its std is float64 \(\), and must be float32 \(\)"),
     ):
         state = replace(
             states[-1], extra=read_only({**stored, evosax.STATE: changed, evosax.VERSION: np.array([0, 2])})
