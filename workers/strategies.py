@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.child import answer_parent
-from workers.xla_cache import xla_cache_settings
+from workers.compiling import xla_cache_settings
 
 Arrays = Mapping[str, NDArray[Any]]
 SIZES = ((8, 4), (16, 7))
