@@ -307,6 +307,13 @@ def _is_idle(key: str, task: TaskSpec | None, settings: type[SearchConfig] | Non
     )
 
 
+def _same(given: Any, value: Any) -> bool:
+    """Whether a value that a config gives, perhaps with lists, is one that it has, with tuples in their place."""
+    if isinstance(given, list | tuple) and isinstance(value, tuple):
+        return len(given) == len(value) and all(map(_same, given, value))
+    return given == value
+
+
 def _idle_problems(
     idle: Mapping[str, Any], values: Values, algorithms: Methods, task: TaskSpec | None
 ) -> list[Problem]:
@@ -320,7 +327,7 @@ def _idle_problems(
     problems = []
     for key, value in idle.items():
         is_plain = isinstance(value, int | float | str | list | tuple | None)
-        if asks(key, value) or key not in values or (is_plain and as_tuple(value) == values[key]):
+        if asks(key, value) or key not in values or (is_plain and _same(value, values[key])):
             continue
         if task is not None and _is_idle(key, task, None):
             what = f"{show(value)} has no effect with {task.name}, which has no policy; leave it out"

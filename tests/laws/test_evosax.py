@@ -283,7 +283,7 @@ def test_what_is_done_with_runs_is_done_with_these(tmp_path):
 @pytest.mark.slow
 def test_options_are_swept_and_left_out_for_optimisers_without_them(tmp_path):
     grid = {"search.algorithm": ["evosax:CMA_ES", "evosax:SNES"], "search.options.c_mean": [0.8, 1.0]}
-    runs = plan(config_of(), tmp_path, grid, [0, 1])
+    runs = plan(config_of(), tmp_path, grid, [0, 1], ["search.population_size=12"])
     assert len(runs) == 2 * (2 + 1)
 
 
