@@ -118,8 +118,10 @@ def _optimizers() -> Mapping[str, Callable[[float], Any]]:
 
 def _arguments(kind: Any) -> dict[str, inspect.Parameter]:
     """Arguments with which an algorithm is made, but for those that all have."""
-    arguments = inspect.signature(kind).parameters
-    return {key: it for key, it in arguments.items() if key not in ("population_size", "solution")}
+    from evosax.algorithms.base import EvolutionaryAlgorithm
+
+    common = inspect.signature(EvolutionaryAlgorithm).parameters
+    return {key: it for key, it in inspect.signature(kind).parameters.items() if key not in common}
 
 
 def _has_population(kind: Any) -> bool:
