@@ -35,6 +35,8 @@ RESULTS = Path(__file__).parent / "results" / "goal_archives.csv"
 EXPLORE_STEPS = {"ant_u_maze": 50_000_000, "ant_big_maze": 200_000_000, "ant_hardest_maze": 400_000_000}
 GOAL_STEPS = 25_000_000
 """Environment steps of the polish of each goal."""
+OBSERVATION = "task.options.observation=without_goal"
+"""A policy of the archive is for one goal, and does not see that of the episode."""
 POLISH = (
     "task.options.reward=dense",
     "search.pairs=32",
@@ -56,7 +58,8 @@ def command(*words: object, settings: Sequence[str]) -> None:
 def archive(task: str, seed: int, settings: Sequence[str]) -> pd.DataFrame:
     """Rows of a seed: one for each goal."""
     folder, started = RUNS / f"{task}_{seed}", time.time()
-    explore = [f"task.environment={task}", f"budget.env_steps={EXPLORE_STEPS[task]}", f"seed={seed}"]
+    own = [setting for setting in settings if setting.startswith("task.")]
+    explore = [f"task.environment={task}", OBSERVATION, f"budget.env_steps={EXPLORE_STEPS[task]}", f"seed={seed}", *own]
     command("run", "ant_big_maze_memes", "--or-resume", "--out", folder / "explore", settings=explore)
     polish = [*POLISH, f"budget.env_steps={GOAL_STEPS}", *settings]
     command("polish", folder / "explore", "--goals", "all", "--out", folder / "polish", settings=polish)
@@ -71,7 +74,7 @@ def table(rows: pd.DataFrame) -> str:
     """A line for each task and seed: how many goals are reached in at least half of the episodes, and how often the
     archive reaches a goal that is drawn."""
     lines = ["| task | seed | goals reached | share of episodes | steps |", "| --- | --- | --- | --- | --- |"]
-    for _, of in rows.fillna({"settings": ""}).groupby(["task", "seed", "settings"], sort=False):
+    for _, of in rows.groupby(["task", "seed", "settings"], sort=False):
         task, seed, settings, explored = of[["task", "seed", "settings", "explore_steps"]].iloc[0]
         steps = of.env_steps.sum() + explored
         title = f"{task} ({settings})" if settings else task
@@ -116,11 +119,15 @@ def main() -> None:
     if given.draw:
         draw(given.draw)
         return
-    rows = pd.read_csv(RESULTS) if RESULTS.exists() else pd.DataFrame(columns=["task", "seed", "settings"])
+    rows = (
+        pd.read_csv(RESULTS, keep_default_na=False)
+        if RESULTS.exists()
+        else pd.DataFrame(columns=["task", "seed", "settings"])
+    )
     settings = " ".join(given.settings)
     for task in () if given.table else given.tasks:
         for seed in seeds_of(given.seeds):
-            same = (rows.task == task) & (rows.seed == seed) & (rows.settings.fillna("") == settings)
+            same = (rows.task == task) & (rows.seed == seed) & (rows.settings == settings)
             if same.any():
                 continue
             rows = pd.concat([rows, archive(task, seed, given.settings)], ignore_index=True)
