@@ -24,10 +24,10 @@ class Line:
     observation_size, action_size, episode_steps = 1, 1, 20
     descriptor_names, descriptor_bounds = ("x",), ((-0.2, 0.2),)
     options = {"goal": ("none", "left", "right")}  # noqa: RUF012
-    goals, goal_radius = {"left": (-0.15,), "right": (0.15,)}, 0.05
+    goal_places, goal_radius = {"left": (-0.15,), "right": (0.15,)}, 0.05
 
     def __init__(self, goal="none"):
-        self._goal = self.goals.get(goal, (0.0,))[0]
+        self._goal = self.goal_places.get(goal, (0.0,))[0]
 
     def reset(self, seed):
         """Begin at the left or the right of the middle."""
@@ -69,7 +69,7 @@ def test_each_goal_has_a_config_that_ranks_by_it(parent):
     steps = int(parent.history["env_steps"].iloc[-1])
     for label, source in configs:
         config = load_config(source)
-        place, search = Line.goals[label], config.search
+        place, search = Line.goal_places[label], config.search
         assert isinstance(search, CandidatesConfig)
         assert config.task.options == {"goal": label}
         assert (search.algorithm, search.candidate_choice) == ("polish", "place")
@@ -124,11 +124,11 @@ def test_options_that_need_goals_or_do_not_fit_them_are_refused(parent, words, s
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"goals": {"left": (0.1, 0.2)}}, "tuples of finite numbers, 1 in each"),
-        ({"goals": ["left"]}, "is not a mapping"),
-        ({"goals": {"up": (0.1,)}}, "goals has up, which the option goal cannot be"),
-        ({"options": {}}, "goals has left, right, which the option goal cannot be"),
-        ({"goal_radius": 0.0}, "goals needs goal_radius"),
+        ({"goal_places": {"left": (0.1, 0.2)}}, "tuples of finite numbers, 1 in each"),
+        ({"goal_places": ["left"]}, "is not a mapping"),
+        ({"goal_places": {"up": (0.1,)}}, "goal_places has up, which the option goal cannot be"),
+        ({"options": {}}, "goal_places has left, right, which the option goal cannot be"),
+        ({"goal_radius": 0.0}, "goal_places needs goal_radius"),
         ({"goal_radius": float("nan")}, "goal_radius = nan is not a finite number"),
     ],
 )

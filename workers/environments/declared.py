@@ -94,7 +94,7 @@ KEPT_ATTRIBUTES = (
     "walls",
     "wall_clearance",
     "goal",
-    "goals",
+    "goal_places",
     "goal_radius",
     "least_reward",
     "final_fitness",
@@ -201,7 +201,7 @@ def task_of_class(
         walls=getattr(task, "walls", None),
         wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
         goal=getattr(task, "goal", None),
-        goals={name: tuple(map(float, place)) for name, place in getattr(task, "goals", {}).items()},
+        goals={name: tuple(map(float, place)) for name, place in getattr(task, "goal_places", {}).items()},
         goal_radius=float(getattr(task, "goal_radius", 0.0)),
         least_reward=getattr(task, "least_reward", None),
         success=_success_in_words(task),
@@ -216,14 +216,16 @@ def _wrong_goals(task: Any, size: int) -> list[str]:
     Args:
         size: number of dimensions of the descriptor.
     """
-    goals: Any = getattr(task, "goals", {})
+    goals: Any = getattr(task, "goal_places", {})
     if not isinstance(goals, Mapping) or not all(are_finite(place) and len(place) == size for place in goals.values()):
-        return [f"goals = {goals!r} is not a mapping from names to tuples of finite numbers, {size} in each"]
+        return [f"goal_places = {goals!r} is not a mapping from names to tuples of finite numbers, {size} in each"]
     option = declared_options(task)[0].get("goal")
     lacking = [name for name in goals if option is None or name not in option.choices]
-    wrong = [f"goals has {', '.join(map(str, lacking))}, which the option goal cannot be"] if lacking else []
+    wrong = [f"goal_places has {', '.join(map(str, lacking))}, which the option goal cannot be"] if lacking else []
     if goals and not getattr(task, "goal_radius", 0.0) > 0.0:
-        wrong.append("goals needs goal_radius, the distance within which an episode has reached its goal, above 0")
+        wrong.append(
+            "goal_places needs goal_radius, the distance within which an episode has reached its goal, above 0"
+        )
     return wrong
 
 
