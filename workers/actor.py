@@ -25,16 +25,17 @@ from workers import progress
 from workers.compiling import xla_cache_settings
 
 if TYPE_CHECKING:  # they import JAX, whose settings are made here
-    from workers.compiling import Compilable
+    from workers.cores import Cores
     from workers.reports import Reports
+    from workers.worker import Made
 
 KEPT_LOGS = 16
 """Ended workers of a job whose output stays on a node."""
 
 
 class WorkerActor:
-    """One worker of a run. Its methods are called in the order of the requests, one at a time or two side by side: then
-    cores that have nothing left to do of one work item begin the next one."""
+    """One worker of a run, and of others after it if it stays. Its methods are called in the order of the requests, one
+    at a time or two side by side: then cores that have nothing left to do of one work item begin the next one."""
 
     def __init__(self, spec: bytes, index: int, gpus: float = 0.0, cores: int = 1) -> None:
         """Keep the arguments; `build` makes the worker.
@@ -47,9 +48,14 @@ class WorkerActor:
         """
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
         self._task_code: tuple[str, ...] = ()
-        self._run_chunks: Compilable | None = None
+        self._of_all: Cores | None = None
+        self._made: Made | None = None
         self._received: Received | None = None
         self._reports: Reports | None = None
+        self._watched: list[int] = []
+        """Numbers of the files of its output, see `NewestOutput`."""
+        self._before_s = 0.0
+        """Seconds of processors that it has used for earlier runs."""
         self._turn = Lock()
         """Held while it compiles, and while it takes the arrays that came with a call."""
 
@@ -68,35 +74,47 @@ class WorkerActor:
         ask it."""
         return progress.seen(), self._reports and self._reports.report()
 
-    def build(self) -> str:
+    def build(self, given: bytes | None = None) -> str:
         """Import JAX with the settings of all workers and build the run's functions; returns the platform's text.
+
+        What it tells of its output and of its processors' time begins anew.
+
+        Args:
+            given: the pickled WorkerSpec of another run, which takes over an actor that has nothing left to do.
 
         Raises:
             OtherCodeError: this host must not work for the run: it has other code than the driver, or another platform
                 than the run's.
         """
-        spec = pickle.loads(self._spec)
-        for descriptor in (1, 2):  # Ray has a file for each of the two
-            with suppress(OSError):  # a Ray that takes the output through a pipe has limits of its own
-                newest_output().add(descriptor, spec.output_bytes // 2)
-        with suppress(OSError):
-            remove_old_logs(Path(os.readlink("/proc/self/fd/1")))
+        spec, is_new = pickle.loads(given or self._spec), self._of_all is None
+        if is_new:
+            for descriptor in (1, 2):  # Ray has a file for each of the two
+                with suppress(OSError):  # a Ray that takes the output through a pipe has limits of its own
+                    self._watched.append(newest_output().add(descriptor, spec.output_bytes // 2))
+            with suppress(OSError):
+                remove_old_logs(Path(os.readlink("/proc/self/fd/1")))
+        else:
+            self._before_s = seconds_so_far()
+            for file in self._watched:
+                os.ftruncate(file, 0)
         if problem := why_refused(spec.sources, spec.task_code, spec.platform):
             raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update({DEPTH: "1"} | environment | xla_cache_settings())
-        from workers.cores import make_worker_with_cores
-        from workers.reports import Reports, require_room
+        from workers.cores import Cores
+        from workers.reports import reports_of, require_room
         from workers.rollouts import BACKENDS, platform_of_gpu
 
         self._task_code = spec.task_code
         self._received = Received(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(*self._task_code):
-            self._reports = Reports(spec, self._cores)
-            self._run_chunks = make_worker_with_cores(spec, self._cores)
-            require_room(spec, self._cores)
+            self._reports = reports_of(spec, self._cores, before=self._reports)
+            self._of_all = self._of_all or Cores(self._cores)
+            self._made = self._of_all.made(spec)
+            if is_new:
+                require_room(spec, self._cores)
         return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
     def compile(self, item: bytes, *arrays: bytes) -> float:
@@ -104,19 +122,19 @@ class WorkerActor:
 
         The engine calls this before the first call of `run` for each kind of chunk.
         """
-        assert self._run_chunks is not None, "compile was called before build"
+        assert self._made is not None, "compile was called before build"
         with self._turn, sendable(*self._task_code):
-            return self._run_chunks.seconds_to_compile(self._unpacked(item, arrays))
+            return self._made.seconds_to_compile(self._unpacked(item, arrays))
 
     def run(self, item: bytes, *arrays: bytes) -> bytes:
         """Run chunks; returns the pickled (results, its report or None, seconds of processors that its process and
-        those of its cores have used), or None if it lacks arrays.
+        those of its cores have used for this run so far), or None if it lacks arrays.
 
         Args:
             item: pickled (arrays by name, origins, work) of a `Parcel`.
             arrays: large arrays by name, each pickled.
         """
-        assert self._run_chunks is not None, "run was called before build"
+        assert self._made is not None, "run was called before build"
         assert self._reports is not None, "build makes them, too"
         with sendable(*self._task_code):
             try:
@@ -124,8 +142,8 @@ class WorkerActor:
                     work = self._unpacked(item, arrays)
             except LackingError:
                 return pickle.dumps(None)
-            self._reports.note(results := self._run_chunks(work))
-            seconds = cpu_seconds(child.pid for child in active_children() if child.pid is not None)
+            self._reports.note(results := self._made.run_chunks(work))
+            seconds = seconds_so_far() - self._before_s
             return pickle.dumps((results, self._reports.report(), seconds), pickle.HIGHEST_PROTOCOL)
 
     def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
@@ -135,6 +153,11 @@ class WorkerActor:
         for named in (small, *map(pickle.loads, arrays)):
             self._received.add(named)
         return self._received.work(origins, work)
+
+
+def seconds_so_far() -> float:
+    """Seconds of processors that this process has used, and those of its cores."""
+    return cpu_seconds(child.pid for child in active_children() if child.pid is not None)
 
 
 def remove_old_logs(own: Path) -> None:

@@ -12,10 +12,10 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from es_service.protocol.child import end_with
 from es_service.protocol.gradient_tree import with_neighbours_added
@@ -24,50 +24,67 @@ from es_service.protocol.user_code import sendable
 from workers import progress
 from workers.compiling import Compilable
 from workers.rollouts import BACKENDS
-from workers.worker import make_worker
+from workers.worker import Made, compiled_before, made_before
 
 PARTS_PER_CORE = 2
 """Parts of a work item for each core, so that a core that finishes early takes over a part of another one."""
 AnyWork = TypeVar("AnyWork")
 
 
-class _Child(NamedTuple):
-    worker: Compilable
-    task_code: tuple[str, ...]
-    """The name of the task."""
+@dataclass
+class _Child:
+    """What a child process has."""
+
     barrier: Any
     """Barrier of all children of the worker."""
+    before: dict[str, Any] = field(default_factory=dict)
+    """See `compiled_before`."""
+    worker: Compilable | None = None
+    task_code: tuple[str, ...] = ()
+    """The name of the task."""
 
 
 _child: _Child | None = None
 """Set in a child process, by `_begin_child`."""
 
 
-def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
-    """`make_worker` for a worker that may use several cores at a time.
+class Cores:
+    """The cores of a worker, which compute for one run after another, all of the same rollout.
 
     The environment must already allow each JAX one thread only. If a child process ends, so does this process, since
     the loss of a core is the loss of the worker.
     """
-    if cores == 1:
-        return make_worker(spec)
-    if BACKENDS[spec.rollout].runs_in_threads:
-        worker, pool = make_worker(spec), ThreadPoolExecutor(cores)
-        return Compilable(lambda work: divided(pool, worker.run, work, cores), worker.compile)
-    context = get_context("spawn")  # a forked JAX would not work
-    given = (spec, os.getpid(), context.Barrier(cores), progress.shared_rows(context, cores))
-    pool = ProcessPoolExecutor(cores, context, _begin_child, given)
-    _together(pool, _meet, [()] * cores)  # from now on there is a child for each core
 
-    def run(work: Sequence[Work]) -> list[ChunkResult]:
-        with progress.call() as call:
-            return divided(pool, partial(_run_child, call), with_made_policies(work), cores)
+    def __init__(self, cores: int) -> None:
+        """Start nothing yet."""
+        self._cores, self._before = cores, dict[str, Any]()
+        self._pool: Executor | None = None
 
-    def compile_in_children(work: Sequence[Work]) -> None:
-        with progress.call() as call:
-            _together(pool, _compile_in_child, [(call, with_made_policies(work))] * cores)
+    def made(self, spec: WorkerSpec) -> Made:
+        """What computes the chunks of a run, as `make_worker` makes it for one core."""
+        if self._cores == 1:
+            return compiled_before(self._before, spec)
+        if BACKENDS[spec.rollout].runs_in_threads:
+            worker, compiled = compiled_before(self._before, spec)
+            self._pool = pool = self._pool or ThreadPoolExecutor(self._cores)
+            return Made(Compilable(lambda work: divided(pool, worker.run, work, self._cores), worker.compile), compiled)
+        self._pool = pool = self._pool or self._children()
+        _together(pool, _make_in_child, [(spec,)] * self._cores)  # from now on there is a child for each core
 
-    return Compilable(run, compile_in_children)
+        def run(work: Sequence[Work]) -> list[ChunkResult]:
+            with progress.call() as call:
+                return divided(pool, partial(_run_child, call), with_made_policies(work), self._cores)
+
+        def compile_in_children(work: Sequence[Work]) -> None:
+            with progress.call() as call:
+                _together(pool, _compile_in_child, [(call, with_made_policies(work))] * self._cores)
+
+        return Made(Compilable(run, compile_in_children), made_before(self._before, spec, lambda _: set[str]()))
+
+    def _children(self) -> Executor:
+        context = get_context("spawn")  # a forked JAX would not work
+        given = (os.getpid(), context.Barrier(self._cores), progress.shared_rows(context, self._cores))
+        return ProcessPoolExecutor(self._cores, context, _begin_child, given)
 
 
 def with_made_policies(work: Sequence[Work]) -> list[Work]:
@@ -108,12 +125,23 @@ def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
     return [work[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _begin_child(spec: WorkerSpec, parent: int, barrier: Any, rows: tuple[Any, Any]) -> None:
+def _begin_child(parent: int, barrier: Any, rows: tuple[Any, Any]) -> None:
     """Prepare a child process, which ends with its parent."""
     global _child
     end_with(parent)
     progress.use_row(*rows)
-    _child = _Child(make_worker(spec), spec.task_code, barrier)
+    _child = _Child(barrier)
+
+
+def _make_in_child(spec: WorkerSpec) -> None:
+    """Make what computes the chunks of a run."""
+    assert _child is not None, "the pool initialises each child"
+    progress.belongs_to(0)  # to no call, as while the worker starts
+    try:
+        with sendable(*spec.task_code):
+            _child.worker, _child.task_code = compiled_before(_child.before, spec).run_chunks, spec.task_code
+    finally:
+        _meet()
 
 
 def _meet() -> None:
@@ -124,6 +152,7 @@ def _meet() -> None:
 
 def _compile_in_child(call: int, work: Sequence[Work]) -> None:
     assert _child is not None, "the pool initialises each child"
+    assert _child.worker is not None, "it is made for each run"
     progress.belongs_to(call)
     try:
         with sendable(*_child.task_code):
@@ -134,6 +163,7 @@ def _compile_in_child(call: int, work: Sequence[Work]) -> None:
 
 def _run_child(call: int, work: Sequence[Work]) -> list[ChunkResult]:
     assert _child is not None, "the pool initialises each child"
+    assert _child.worker is not None, "it is made for each run"
     progress.belongs_to(call)
     with sendable(*_child.task_code):
         return _child.worker(work)

@@ -1,4 +1,5 @@
-"""Joining or starting a Ray cluster: whether its head is there and accepts this process, and watching its nodes.
+"""Joining or starting a Ray cluster: whether its head is there and accepts this process, staying connected for the next
+run, and watching its nodes.
 
 After each call, the caller's signal handlers and environment variables are the same as before.
 """
@@ -17,17 +18,19 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from es_service.config.model import ENGINE_IMPLIES
-from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, read_membership
+from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, ask_head, cores_of_nodes, read_membership
+from es_service.dispatch.staying import staying
 from es_service.errors import EvaluationError, Interrupted, StartError, WayOut
 from es_service.logs import logger
 from es_service.protocol.machine import given_path
+from es_service.protocol.process_environment import child_environment
 
 # Whether the head of a Ray cluster is at an address and accepts this process, which Ray itself takes a minute to say.
 #
@@ -192,7 +195,7 @@ WITHOUT_RAY = WayOut(
 
 
 def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
-    """The `ray` module, connected to a cluster.
+    """The `ray` module, newly connected to a cluster. A connection that waits ends, since Ray allows only one.
 
     Args:
         address: "HOST:PORT" of the cluster, "auto" for the one on this machine, or None to start one here.
@@ -204,6 +207,8 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
             to the cluster failed.
         Interrupted: SIGTERM arrived during the call.
     """
+    if (waiting := staying().take(RAY)) is not None:
+        waiting.end()
     ways_out = [WITHOUT_RAY]
     options: dict[str, Any] = {"address": address}
     settings = dict(SETTINGS)
@@ -310,6 +315,137 @@ def nodes_of_cluster(address: str) -> list[int]:
         return cores_of_nodes(ray)
     finally:
         disconnect(ray)
+
+
+class Connection:
+    """A Ray that this process has joined or started, and actors there that wait for the next run."""
+
+    def __init__(self, ray: ModuleType, use: Hashable = None, cpus: int | None = None) -> None:
+        """Begin without actors.
+
+        Args:
+            ray: the module, which is connected.
+            use: what else it can be used for: runs with the same.
+            cpus: number of its CPUs, if it was started here; None: it was joined.
+        """
+        self.ray, self.use, self.cpus = ray, use, cpus
+        self.keeps_logs = False
+        """Whether the logs of a Ray of our own are needed when it has ended."""
+        self._job = _job(ray)
+        self._actors: list[tuple[Hashable, Any]] = []
+        """What an actor can be used for, and the actor."""
+        self._made: dict[Hashable, Any] = {}
+        self._is_used = threading.Event()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether this process is still connected to it; the user may have ended that, and have begun another one."""
+        return self.ray.is_initialized() and _job(self.ray) == self._job
+
+    def answers(self) -> bool:
+        """Whether its head answers."""
+        try:
+            ask_head(self.ray)
+        except Exception:  # of several classes
+            return False
+        return True
+
+    def remote(self, what: Any, make: Callable[[], Any], *given: Hashable) -> Any:
+        """A class or function as Ray's own, which is made once, since Ray keeps each for good.
+
+        Args:
+            make: makes it.
+            given: the options with which it is made.
+        """
+        if (what, *given) not in self._made:
+            self._made[what, *given] = make()
+        return self._made[what, *given]
+
+    def rest(self, use: Hashable, actors: list[Any]) -> None:
+        """Wait for the next run, inside a block of `workers`, with these actors; elsewhere end."""
+        self._actors += [(use, actor) for actor in actors]
+        self._is_used = used = threading.Event()
+        staying().give(RAY, self)
+        if not used.is_set():  # else it has ended
+            threading.Thread(target=self._look, args=(used,), daemon=True, name="waiting-cluster").start()
+
+    def begin(self) -> None:
+        """It is used again."""
+        self._is_used.set()
+
+    def take(self, use: Hashable) -> list[Any]:
+        """The actors that can be used for a run and answer at once; the others end, since they have the cores that the
+        run needs."""
+        actors, self._actors = self._actors, []
+        errors, asked = self.ray.exceptions.RayError, dict[Any, Any]()
+        for able, actor in actors:
+            if able == use:
+                with contextlib.suppress(errors):
+                    asked[actor.place.remote()] = actor
+        answered, _ = self.ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_S) if asked else ([], [])
+        taken = []
+        for ref in answered:
+            with contextlib.suppress(errors):
+                self.ray.get(ref)
+                taken.append(asked[ref])
+        self._kill([actor for _, actor in actors if actor not in taken])
+        return taken
+
+    def kill(self) -> None:
+        """Kill the actors."""
+        actors, self._actors = self._actors, []
+        if self.is_running:
+            self._kill([actor for _, actor in actors])
+
+    def end(self) -> None:
+        """Kill the actors, and leave the cluster; one of our own ends."""
+        self._is_used.set()
+        self.kill()
+        if self.is_running:
+            disconnect(self.ray, forget=self.cpus is not None and not self.keeps_logs)
+        else:
+            _let_print(self.ray, True)
+
+    def _kill(self, actors: list[Any]) -> None:
+        for actor in actors:
+            with contextlib.suppress(self.ray.exceptions.RayError, ValueError):
+                self.ray.kill(actor, no_restart=True)
+
+    def _look(self, used: threading.Event) -> None:
+        """End if the head has not answered for SILENCE_S seconds while it waits: Ray would end this process."""
+        answered_s = time.monotonic()
+        while not used.wait(MEMBERSHIP_S) and self.is_running:
+            if self.answers():
+                answered_s = time.monotonic()
+            elif time.monotonic() - answered_s > SILENCE_S:
+                staying().end(self)
+                return
+
+
+RAY = "ray"
+"""What a connection that waits can be used for, as `Staying` has it: this process has one at most."""
+ANSWER_S = 5.0
+"""Longest wait in seconds for actors that are to be taken over; one that has nothing to do answers in milliseconds."""
+
+
+def connected(address: str | None, *, gpus: bool, cpus: int) -> Connection:
+    """The connection that waits, if it is to the same cluster and its head answers, or else a new one.
+
+    Args and raises as `connect`; a Ray of our own that waits may have more CPUs.
+    """
+    use = address, gpus, os.getcwd(), *sorted(child_environment().items())
+    if (waiting := staying().take(RAY)) is not None:
+        if waiting.use == use and (waiting.cpus is None or waiting.cpus >= cpus) and waiting.answers():
+            waiting.begin()
+            return waiting
+        waiting.end()
+    return Connection(connect(address, gpus=gpus, cpus=cpus), use, cpus if address is None else None)
+
+
+def _job(ray: ModuleType) -> tuple[str, str]:
+    """What tells a connection from a later one."""
+    context = ray.get_runtime_context()
+    return context.get_node_id(), context.get_job_id()
 
 
 class Watch:

@@ -15,7 +15,6 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from types import ModuleType
 from typing import Any
 
 from es_service.config.workload import ANY_NUMBER
@@ -43,9 +42,10 @@ from es_service.dispatch.ray_calls import (
     fault_reason,
     raised_in_actor,
 )
-from es_service.dispatch.ray_cluster import Watch, connect, disconnect
+from es_service.dispatch.ray_cluster import Connection, Watch, connected
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
-from es_service.protocol.machine import cores, cpu_seconds
+from es_service.dispatch.staying import use_of
+from es_service.protocol.machine import cores
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec
 from es_service.protocol.sent import LACKS_AGAIN, Memory
 from es_service.protocol.sources import OtherCodeError
@@ -70,6 +70,7 @@ def ray_engine(
     gpus: float = 0.0,
     most: int = ANY_NUMBER,
     grows: bool = False,
+    alone: bool = False,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_compile: Callable[[str, str], None] = lambda kind, text: None,
@@ -89,6 +90,7 @@ def ray_engine(
         most: number of cores that have work; no more start, except that an actor has all of its cores.
         grows: whether to use as many cores as there is room for, also when the room changes, and to ask for more if
             `cpus` is given, see `ASKED_AHEAD`; if not, use the number in `limits`.
+        alone: whether an actor serves only runs with the same constants, whatever their seed, if it stays.
         on_wait: as in `Engine`; not called in a Ray of our own, which has room.
         on_compile: as in `Engine`.
         on_refusal, on_report: as in `Actors`.
@@ -99,18 +101,31 @@ def ray_engine(
     """
     each = cpus or 1
     ours = cores() if grows else with_work(limits.workers, each, most) * each
-    ray = connect(address, gpus=bool(gpus), cpus=ours)
+    if address is None:
+        most = min(most, ours)  # if a Ray of our own has stayed, it may have more
+    connection = connected(address, gpus=bool(gpus), cpus=ours)
     try:
+        ray = connection.ray
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, grows=grows, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        at_once = limits.items_at_once
         transport = Actors(
-            ray, spec, actor, claim, watch, growth, limits.workers, on_refusal, on_report, items_at_once=at_once
+            connection,
+            spec,
+            actor,
+            claim,
+            watch,
+            growth,
+            limits.workers,
+            on_refusal,
+            on_report,
+            items_at_once=limits.items_at_once,
+            alone=alone,
         )
         on_wait = (lambda shortage: None) if watch is None else on_wait
         return Engine(transport, limits, should_stop, log, on_wait, on_compile)
     except BaseException:
-        disconnect(ray)
+        connection.keeps_logs = True
+        connection.end()
         raise
 
 
@@ -119,7 +134,7 @@ class Actors:
 
     def __init__(
         self,
-        ray: ModuleType,
+        connection: Connection,
         spec: WorkerSpec,
         actor: type,
         claim: Claim,
@@ -129,22 +144,31 @@ class Actors:
         on_refusal: Callable[[str], None] = lambda refusal: None,
         on_report: Callable[[str, Report], None] = lambda worker, report: None,
         items_at_once: int = 1,
+        *,
+        alone: bool = False,
     ) -> None:
         """Make a transport without workers.
 
         Args:
+            connection: a Ray, with actors that wait there; `close` gives it back, or ends it.
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
             growth: when the room for workers changes, `SetWorkers` follows it; None: no `SetWorkers`.
             workers: number of workers wanted at the start.
             on_refusal: called once for each host whose code is not the driver's, with what its worker said.
             on_report: called with a worker's name and its report.
             items_at_once: number of calls that an actor answers side by side, each in a thread.
+            alone: as in `ray_engine`.
         """
-        self._ray = ray
+        self._connection, self._ray = connection, (ray := connection.ray)
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
         options = {"num_cpus": claim.cpus, "num_gpus": claim.gpus, "max_restarts": 0, "max_task_retries": 0}
-        self._class = ray.remote(**options, max_concurrency=items_at_once, concurrency_groups={LOOKS: 1})(actor)
-        self._read = ray.remote(num_cpus=0, max_retries=0)(ends_of_files)  # once, since Ray keeps each for good
+        options |= {"max_concurrency": items_at_once, "concurrency_groups": {LOOKS: 1}}
+        self._class = connection.remote(actor, lambda: ray.remote(**options)(actor), claim, items_at_once)
+        reads = {"num_cpus": 0, "max_retries": 0}
+        self._read = connection.remote(ends_of_files, lambda: ray.remote(**reads)(ends_of_files))
+        self._use: Hashable = (use_of(spec, alone=alone), actor, claim, items_at_once)
+        self._waiting = connection.take(self._use)
+        """Actors that have served other runs."""
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls, self._arguments = Calls(ray), Arguments(ray)
@@ -181,14 +205,17 @@ class Actors:
         return dict(self._places)
 
     def start(self, worker: int) -> None:
-        """Ask Ray for an actor. It is up when it has a place and has built its functions."""
+        """Ask Ray for an actor, or take one that waits. It is up when it has a place and has built its functions."""
         try:
-            at = self._class.options(**self._where(worker))
-            handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
+            if self._waiting:
+                handle, given = self._waiting.pop(0), (self._spec,)
+            else:
+                at, cores = self._class.options(**self._where(worker)), 1 if self._claim.gpus else self._claim.cpus
+                handle, given = at.remote(self._spec, worker, self._claim.gpus, cores), ()
             self._handles[worker], self._compiled[worker] = handle, set()
             self._memories[worker] = Memory(self._parent_cache_bytes, int)
             self._calls[handle.place.remote()] = Call(worker, "place")
-            self._calls[handle.build.remote()] = Call(worker, "build")
+            self._calls[handle.build.remote(*given)] = Call(worker, "build")
         except self._ray.exceptions.RayError as error:
             self._lose(worker, f"cannot be started: {error}")
 
@@ -242,9 +269,9 @@ class Actors:
         self._calls[ref] = Call(worker, "run", item_id, attempt, work)
 
     def cpu_s(self) -> float:
-        """Seconds of the processors of this process, and of each actor by its newest answer; without those of Ray's own
-        processes."""
-        return cpu_seconds(()) + sum(self._cpu_s.values())
+        """Seconds of the processors of this process, and of each actor for this run by its newest answer; without those
+        of Ray's own processes."""
+        return time.process_time() + sum(self._cpu_s.values())
 
     def platforms(self) -> frozenset[str]:
         """`machine.platform_text` of each kind of actor that has come up."""
@@ -285,15 +312,18 @@ class Actors:
         return None
 
     def close(self) -> None:
-        """Kill all actors, which end within seconds in a cluster that was joined; a Ray of our own has then ended."""
+        """Kill all actors, which end within seconds in a cluster that was joined; a Ray of our own has then ended. In a
+        block of `workers`, those with nothing to do stay, and the connection with them."""
         if self._watch is not None:
             self._watch.close()
         # The logs of a Ray of our own are not needed if workers got places and none was lost.
-        forget = self._watch is None and bool(self._places) and not self._has_lost
+        self._connection.keeps_logs |= self._has_lost or not self._places
+        busy = set(self._calls.oldest()) | self._drained
+        idle = [self._handles.pop(worker) for worker in sorted(self._up - busy) if worker in self._handles]
         for worker in list(self._handles):
             self.kill(worker)
         self._arguments.forget()
-        disconnect(self._ray, forget=forget)
+        self._connection.rest(self._use, [*idle, *self._waiting])
 
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions

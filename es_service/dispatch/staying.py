@@ -1,4 +1,4 @@
-"""Workers that stay: what waits for the next run of this program."""
+"""Workers that stay: what waits for the next run of this program, processes of workers or a Ray with its actors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDLE_PER_CORE = 2
 
 
 class CanWait(Protocol):
-    """What can wait, such as the process of a worker."""
+    """What can wait: the process of a worker, or a Ray with its actors."""
 
     @property
     def is_running(self) -> bool:
@@ -61,6 +61,13 @@ class Staying:
             self._idle += [(use, waiting)]
             most = IDLE_PER_CORE * cores() if self._blocks else 0
             ended = [self._idle.pop(0) for _ in range(len(self._idle) - most)]
+        _end(ended)
+
+    def end(self, waiting: CanWait) -> None:
+        """End something, if it still waits."""
+        with self._turn:
+            ended = [entry for entry in self._idle if entry[1] is waiting]
+            self._idle = [entry for entry in self._idle if entry[1] is not waiting]
         _end(ended)
 
     def enter(self) -> None:
@@ -106,7 +113,7 @@ def use_of(spec: WorkerSpec, *, alone: bool) -> Hashable:
 
 @contextmanager
 def workers() -> Iterator[None]:
-    """Inside the block, workers of the engine `inline` stay when a run or an evaluator ends, and serve the next ones.
+    """Inside the block, workers stay when a run or an evaluator ends, and serve the next ones.
 
         with es_service.workers():
             for sigma in (0.02, 0.05, 0.1):
@@ -118,9 +125,14 @@ def workers() -> Iterator[None]:
     or size of chunks is compiled anew. An environment of Python objects or a function has a process only for runs with
     the same task and policy. All results have the bits that they have without the block.
 
-    A worker that was lost, or was computing when its run ended, does not stay. Two processes wait for each core at
-    most. What the code of a task has read from a file or changed in its modules stays, too. Blocks can be nested:
-    nothing is left running after the last one. Workers of Ray do not stay, and runs of `ask_tell` have none.
+    With the engine `ray`, this program stays connected to the cluster, or to its own Ray on this machine, and actors
+    with the same cores and GPUs are taken over. They keep the cores of the cluster until the block ends, or until this
+    program computes something for which they cannot be used, joins another cluster or calls `ray.shutdown()`.
+
+    A worker that was lost, or was computing when its run ended, does not stay; nor does an actor that no longer
+    answers. On this machine, two processes wait for each core at most. What the code of a task has read from a file or
+    changed in its modules stays, too. Blocks can be nested: nothing is left running after the last one. Runs of
+    `ask_tell` have no workers.
     """
     here = staying()
     here.enter()

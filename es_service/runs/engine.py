@@ -151,6 +151,7 @@ def make_engine(
             gpus=gpus,
             most=most,
             grows=compute.workers == "auto",
+            alone=alone,
             log=log,
             on_wait=on_wait,
             on_compile=tell_compiling,

@@ -28,7 +28,7 @@ from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreErr
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
-from es_service.protocol.child import END_S, Child, NoAnswerError, require_same_process
+from es_service.protocol.child import Child, NoAnswerError, require_same_process
 from es_service.protocol.machine import given_path
 from es_service.protocol.process_environment import same_imports
 from es_service.protocol.user_code import RaisedError
@@ -173,6 +173,8 @@ COMMANDS = "es_service.cli.in_turn"
 POLL_S = 0.1
 ROWS_S = 1.0
 """Seconds between two readings of the newest generation of each run."""
+LEAVE_S = 20.0
+"""Longest time in seconds in which a process with nothing left to do may end by itself; leaving Ray takes a few."""
 LAST_WORDS_BYTES = 4000
 """At most this many bytes of what a failed run printed are searched for its error."""
 
@@ -295,7 +297,7 @@ def run_planned(
                 while waiting and len(running) < shares.at_once:
                     _start(waiting.popleft(), inside, runs, running, idle)
                 while idle:
-                    idle.pop().end(END_S)  # by itself, so that it closes what it has read
+                    idle.pop().end(LEAVE_S)  # by itself, so that it closes what it has read, and ends its Ray
                 if time.monotonic() - read_s > ROWS_S:
                     read_s = time.monotonic()
                     runs |= {name: replace(runs[name], row=newest(runs[name].folder)) for name in running}
@@ -312,7 +314,7 @@ def run_planned(
             raise
         finally:
             for process in (*idle, *(of.process for of in running.values())):
-                process.end(END_S)
+                process.end(LEAVE_S)
     return list(runs.values())
 
 

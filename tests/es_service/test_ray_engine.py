@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from es_service.dispatch import ray_calls, waits
+from es_service.dispatch import ray_calls, ray_cluster, waits
 from es_service.dispatch import ray_engine as ray_engine_module
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import (
@@ -27,10 +27,11 @@ from es_service.dispatch.events import (
     WorkerUp,
 )
 from es_service.dispatch.ray_calls import IN_CALL_BYTES, Looks
+from es_service.dispatch.ray_cluster import Connection
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
+from es_service.dispatch.staying import staying, workers
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import EvaluationChunk, Report, TrainingChunk, Work, with_subject
 from es_service.protocol.policies import Recipes
 from es_service.protocol.sent import LEAST_BYTES, Received
@@ -89,7 +90,7 @@ class PretendedRay:
     def __init__(self, room: int = 1000) -> None:
         self.exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
         self._private = SimpleNamespace(worker=SimpleNamespace())
-        self.room = room
+        self.room, self.job = room, 1
         self.actors: list[Actor] = []
         self.on_run: Callable[[Actor], Any] = lambda actor: None
         self.node_of: Callable[[int], str] = lambda number: "node"
@@ -134,8 +135,14 @@ class PretendedRay:
     def kill(self, actor: Any, no_restart: bool) -> None:
         self.end(actor.itself)
 
+    def is_initialized(self) -> bool:
+        return self.job > 0
+
+    def get_runtime_context(self) -> Any:
+        return SimpleNamespace(get_node_id=lambda: "node", get_job_id=lambda: str(self.job))
+
     def shutdown(self) -> None:
-        pass
+        self.job = 0
 
     def cluster_resources(self) -> dict[str, float]:
         return {"CPU": 2.0}
@@ -167,7 +174,7 @@ class PretendedRay:
 
         methods = {
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
-            "build": lambda: f"kind {actor.number % 2}",
+            "build": lambda *given: f"kind {actor.number % 2}",
             "compile": compile,
             "run": lambda *item: pickle.dumps(
                 ([f"of {chunk}" for _, chunk in work(*item)], actor.report, 10.0 * (1 + actor.ran))
@@ -223,7 +230,7 @@ def transport(
     claim: Claim = ONE_CORE,
     on_refusal: Callable[[str], None] = lambda refusal: None,
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), claim, watch, growth, limits.workers, on_refusal)
+    return Actors(Connection(ray), SPEC, type(None), claim, watch, growth, limits.workers, on_refusal)
 
 
 def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -257,7 +264,7 @@ def test_seconds_of_processors_are_those_of_the_driver_and_of_all_actors_lost_on
         engine.evaluate(with_subject(FIRST, [CHUNK]))
         used = 10.0 * sum(actor.ran for actor in ray.actors)
         assert ray.actors[0].ran > 0
-        assert engine.transport.cpu_s() - cpu_seconds(()) == pytest.approx(used, abs=1.0)
+        assert engine.transport.cpu_s() - time.process_time() == pytest.approx(used, abs=1.0)
 
 
 def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
@@ -669,3 +676,160 @@ def test_a_call_that_takes_long_is_not_taken_for_one_that_hangs(monkeypatch):
         assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert "no progress with work item TrainingChunk 0 of generation 3 for 0.6 s" in engine.last_loss()
     assert 2.2 < began[1] - began[0] < 8.0
+
+
+@pytest.fixture
+def stays(monkeypatch):
+    """A Ray that `connect` gives, and the list of the connections that were made to it."""
+    ray, made = PretendedRay(), []
+
+    def connect(address, *, gpus, cpus):
+        if (waiting := staying().take(ray_cluster.RAY)) is not None:
+            waiting.end()
+        assert not (made and ray.is_initialized()), "Ray allows one connection at a time"
+        ray.job = len(made) + 1
+        made.append(address)
+        return ray
+
+    monkeypatch.setattr(ray_cluster, "connect", connect)
+    monkeypatch.setattr(ray_cluster, "ask_head", lambda ray: None)
+    monkeypatch.setattr(ray_cluster, "ANSWER_S", 0.1)
+    yield ray, made
+    assert not staying()._idle
+    assert {actor.state for actor in ray.actors} <= {"dead"}
+    assert not ray.is_initialized()
+
+
+def compute(address: str | None = None, given: Any = SPEC, claim: Claim = ONE_CORE, alone: bool = False) -> None:
+    """What one engine with two workers does: one of its actors computes, and both are up."""
+    connection = ray_cluster.connected(address, gpus=False, cpus=2)
+    actors = Actors(connection, given, type(None), claim, None, None, 2, alone=alone)
+    with Engine(actors, Limits(2)) as engine:
+        while len(actors._up) < 2:
+            assert len(engine.evaluate(with_subject(FIRST, [CHUNK]))) == 1
+        assert engine.counts.lost_workers == 0
+
+
+def numbers(ray: PretendedRay, *states: str) -> list[int]:
+    return [place for place, actor in enumerate(ray.actors) if actor.state in states]
+
+
+def test_actors_stay_in_a_block_and_end_with_it(stays):
+    ray, made = stays
+    compute()
+    assert (numbers(ray, "dead"), ray.is_initialized()) == ([0, 1], False)
+    with workers():
+        compute()
+        assert (numbers(ray, "alive"), ray.is_initialized()) == ([2, 3], True)
+        compute(given=replace(SPEC, seed=9, environment="another"))
+    assert (len(ray.actors), len(made)) == (4, 2)
+
+
+@pytest.mark.parametrize("state", ["dead", "hung"])
+def test_an_actor_that_dies_or_hangs_between_two_runs_is_replaced_without_a_word(stays, state):
+    ray, made = stays
+    with workers():
+        compute()
+        ray.end(ray.actors[0], state)
+        compute()
+        assert (numbers(ray, "alive"), ray.actors[0].state) == ([1, 2], "dead")
+    assert len(made) == 1
+
+
+def test_actors_serve_only_runs_of_their_kind(stays):
+    """Those of another kind end, since they have the cores that the run needs."""
+    ray, made = stays
+    other_code = replace(SPEC, sources={**SPEC.sources, "a.py": "0"})
+    with workers():
+        compute()
+        for count, given in enumerate(
+            [
+                {"given": other_code},
+                {"given": other_code, "claim": Claim(2)},
+                {"alone": True},
+                {"alone": True, "given": replace(SPEC, episode_steps=SPEC.episode_steps + 1)},
+            ],
+            start=1,
+        ):
+            compute(**given)
+            assert numbers(ray, "alive") == [2 * count, 2 * count + 1]
+            compute(**given | {"given": replace(given.get("given", SPEC), seed=count)})
+            assert len(ray.actors) == 2 * count + 2
+    assert len(made) == 1
+
+
+def test_a_connection_serves_only_runs_of_the_same_cluster_and_environment(stays, monkeypatch, tmp_path):
+    ray, made = stays
+    with workers():
+        compute()
+        compute("head:6379")
+        monkeypatch.setenv("SIMULATOR_LICENCE", "7")
+        compute("head:6379")
+        monkeypatch.chdir(tmp_path)
+        compute("head:6379")
+        compute("head:6379")
+        monkeypatch.setattr(ray_cluster, "ask_head", lambda ray: 1 / 0)
+        compute("head:6379")
+    assert (made, len(ray.actors)) == ([None, *["head:6379"] * 4], 10)
+
+
+def test_after_a_shutdown_by_the_user_nothing_of_it_is_used_and_nothing_of_the_user_s_is_ended(stays):
+    ray, made = stays
+    with workers():
+        compute()
+        for actor in ray.actors:
+            ray.end(actor)
+        ray.shutdown()
+        ray.job = 7  # the user's own
+        with workers():
+            pass
+    assert ray.is_initialized()
+    ray.shutdown()
+    with workers():
+        compute()
+        ray.shutdown()
+        for actor in ray.actors:
+            ray.end(actor)
+        compute()
+        assert numbers(ray, "alive") == [4, 5]
+    assert len(made) == 3
+
+
+def test_an_error_inside_a_block_and_one_of_a_run_end_the_actors(stays):
+    ray, _ = stays
+
+    @workers()
+    def raises() -> None:
+        compute()
+        assert numbers(ray, "alive") == [0, 1]
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        raises()
+    assert numbers(ray, "alive") == []
+    with workers():
+        ray.on_run = lambda actor: ray.end(actor, "hung")
+        with ray_engine_of(ray) as engine, pytest.raises(EvaluationError):
+            engine.evaluate(with_subject(FIRST, [CHUNK]))
+        assert all(ray.actors[place].ran == 0 for place in numbers(ray, "alive")), "what computes does not stay"
+        ray.on_run = lambda actor: None
+        compute()
+
+
+def ray_engine_of(ray: PretendedRay) -> Engine[Actors]:
+    connection = ray_cluster.connected(None, gpus=False, cpus=2)
+    limits = Limits(2, max_attempts=1, chunk_timeout_s=0.05, first_chunk_timeout_s=0.05)
+    return Engine(Actors(connection, SPEC, type(None), ONE_CORE, None, None, 2), limits)
+
+
+def test_a_cluster_that_does_not_answer_while_it_waits_is_left(stays, monkeypatch):
+    ray, _ = stays
+    monkeypatch.setattr(ray_cluster, "MEMBERSHIP_S", 0.01)
+    monkeypatch.setattr(ray_cluster, "SILENCE_S", 0.05)
+    with workers():
+        compute("head:6379")
+        monkeypatch.setattr(ray_cluster, "ask_head", lambda ray: 1 / 0)
+        until = time.monotonic() + 10.0
+        while staying()._idle and time.monotonic() < until:
+            time.sleep(0.01)
+        assert (ray.is_initialized(), numbers(ray, "alive")) == (False, [])

@@ -20,6 +20,7 @@ from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerUp
 from es_service.dispatch.ray_calls import IN_CALL_BYTES
+from es_service.dispatch.ray_cluster import Connection
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE
 from es_service.errors import EvaluationError
@@ -112,7 +113,7 @@ class ActorsHere(PretendedRay):
 
     def _start(self, spec: bytes, index: int, gpus: float, cores: int) -> Any:
         found, actor = super()._start(spec, index, gpus, cores), WorkerActor(spec, index)
-        actor._run_chunks = COMPUTING
+        actor._made = Made(COMPUTING, set())
         actor._received = Received(self.theirs, Recipes.made)
         actor._reports = Reports(SPEC)
 
@@ -137,7 +138,13 @@ def inline(sender: int, worker: int) -> Iterator[tuple[Engine, Any]]:
 def ray(sender: int, worker: int) -> Iterator[tuple[Engine, Any]]:
     pretended = ActorsHere(worker)
     transport = Actors(
-        pretended, spec(parent_cache_bytes=sender), type(None), ONE_CORE, None, None, WORKERS, lambda _: None
+        Connection(pretended),
+        spec(parent_cache_bytes=sender),
+        type(None),
+        ONE_CORE,
+        None,
+        None,
+        WORKERS,
     )
 
     def sent() -> list[bytes]:
@@ -171,7 +178,7 @@ def test_each_parent_is_sent_at_most_once_to_each_worker_that_keeps_all(engine, 
 def test_a_large_parent_is_stored_once_for_all_actors_and_a_small_one_never():
     for size, is_stored in ((10, False), (IN_CALL_BYTES // 2, True)):
         pretended, generations = ActorsHere(2**40), Generations(size)
-        transport = Actors(pretended, spec(), type(None), ONE_CORE, None, None, WORKERS, lambda _: None)
+        transport = Actors(Connection(pretended), spec(), type(None), ONE_CORE, None, None, WORKERS, lambda _: None)
         with Engine(transport, LIMITS) as evaluator:
             names: set[bytes] = set()
             for _ in range(6):

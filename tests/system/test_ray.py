@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
+import es_service
 from es_service import api
 from es_service.cli.common import error_message
-from es_service.dispatch import ray_engine as module
+from es_service.dispatch import ray_cluster as module
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_engine import Actors, ray_engine
+from es_service.dispatch.staying import staying
 from es_service.errors import EvaluationError, StartError
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
@@ -66,6 +68,37 @@ def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, r
     assert latest.exists() or not latest.is_symlink()
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert dict(os.environ) == environment
+
+
+@pytest.mark.alone
+@pytest.mark.long
+def test_an_actor_stays_in_a_block_until_it_is_killed_or_hangs_or_the_user_ends_ray(tmp_path, reference):
+    import ray
+
+    before, places = sessions(), []
+
+    def again(name):
+        outcome = run(tmp_path / name, workers=1)
+        assert digest_parts(outcome.run.folder) == reference
+        assert outcome.run.history["lost_workers"].sum() == 0
+        [(_, connection)] = staying()._idle
+        [(_, actor)] = connection._actors
+        places.append(ray.get(actor.place.remote()).pid)
+        return outcome.run.history["cpu_s"].iloc[-1]
+
+    with es_service.workers():
+        new_s, taken_over_s = again("new"), again("taken_over")
+        assert taken_over_s < 0.7 * new_s, "without the import of JAX, and without the run before"
+        os.kill(places[-1], signal.SIGKILL)
+        again("after_a_kill")
+        os.kill(places[-1], signal.SIGSTOP)
+        again("after_a_stop")
+        ray.shutdown()
+        again("after_the_end")
+    assert places[0] == places[1]
+    assert len(set(places)) == 4
+    assert not ray.is_initialized()
+    assert len(sessions() - before) <= 1, "the logs of the Ray that the user has ended"
 
 
 @pytest.mark.alone

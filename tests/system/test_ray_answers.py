@@ -11,7 +11,7 @@ import pytest
 
 import es_service
 from es_service import Stop, api
-from es_service.dispatch import ray_engine as module
+from es_service.dispatch import ray_cluster as module
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_cluster import connect, disconnect
 from es_service.dispatch.ray_engine import Actors, ray_engine
@@ -135,7 +135,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
 class Mirror(WorkerActor):
     """An actor that answers each chunk with the environment its worker would have, and Ray's name for its GPU."""
 
-    def build(self) -> str:
+    def build(self, given: bytes | None = None) -> str:
         self._received = Received(2**20, Recipes.made)
         return "a mirror's"
 

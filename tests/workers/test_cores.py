@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import textwrap
 import threading
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -19,8 +21,8 @@ from tests.system.processes import ROOT, is_running
 from tests.workers.test_worker import bits, work
 from workers import cores as module
 from workers.compiling import Compilable
-from workers.cores import make_worker_with_cores, parts
-from workers.worker import make_worker
+from workers.cores import Cores, parts
+from workers.worker import Made, make_worker
 
 
 @given(st.integers(1, 300), st.integers(1, 64))
@@ -40,8 +42,8 @@ def test_threads_with_simd_give_the_results_of_one_core(monkeypatch):
         threads[threading.get_ident()] += 1
         return run(part)
 
-    monkeypatch.setattr(module, "make_worker", lambda _: Compilable(watched, run.compile))
-    found = make_worker_with_cores(worker_spec, 3)(work())
+    monkeypatch.setattr(module, "compiled_before", lambda *_: Made(Compilable(watched, run.compile), set()))
+    found = Cores(3).made(worker_spec).run_chunks(work())
     assert list(map(bits, found)) == list(map(bits, run(work())))
     assert len(threads) == 3
     assert threading.get_ident() not in threads
@@ -55,9 +57,9 @@ if __name__ == "__main__":
     os.environ.update(worker_environment(os.environ))
     from tests.helpers import spec
     from tests.workers.test_worker import work
-    from workers.cores import make_worker_with_cores
+    from workers.cores import Cores
 
-    run = make_worker_with_cores(spec(rollout="xla", episode_steps=30), 2)
+    run = Cores(2).made(spec(rollout="xla", episode_steps=30)).run_chunks
     run.compile(work())  # in each child
     results = run(work())
     if len(sys.argv) > 1:
@@ -152,6 +154,71 @@ def test_an_actor_keeps_the_newest_of_the_files_to_which_ray_has_it_write(tmp_pa
     assert "step 39 is done" in files[1].read_text()
 
 
+HANDED_OVER = """
+import os, pickle, sys, time
+from dataclasses import replace
+
+if __name__ == "__main__":
+    from tests.helpers import spec
+    from tests.workers.test_cores import runs_of_one_actor
+    from tests.workers.test_worker import work
+    from workers.actor import WorkerActor
+
+    rollout, cores, file = sys.argv[1:]
+    given, *others = runs_of_one_actor(rollout)
+    actor = WorkerActor(pickle.dumps(given), 0, cores=int(cores))
+    item, said = pickle.dumps(({}, {}, pickle.dumps(work()))), []
+    for number, other in enumerate((None, *others)):
+        actor.build(other and pickle.dumps(other))
+        begun_s = time.process_time()
+        compile_s = actor.compile(item)
+        os.write(1, b"run %d\\n" % number)
+        answers = [pickle.loads(actor.run(item)) for _ in range(2)]
+        most_s = time.process_time() - begun_s
+        said.append((compile_s, answers, most_s, os.pread(1, 1000, 0)))
+    with open(file, "wb") as written:
+        pickle.dump(said, written)
+"""
+
+
+def runs_of_one_actor(rollout):
+    """Constants of the runs that one actor serves, one after another."""
+    first = spec(rollout=rollout, episode_steps=30)
+    return (
+        replace(first, recycle_after_episodes=10**6),
+        replace(first, seed=5, recycle_after_episodes=10**6),
+        replace(first, episode_steps=20),
+        replace(first, recycle_after_episodes=1),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rollout", "cores"), [("simd", 1), ("simd", 2), pytest.param("xla", 2, marks=pytest.mark.long)]
+)
+def test_an_actor_that_is_taken_over_has_the_bits_of_a_new_one_and_tells_only_of_the_new_run(tmp_path, rollout, cores):
+    program, file, out = tmp_path / "program.py", tmp_path / "said", tmp_path / "out"
+    program.write_text(HANDED_OVER)
+    with out.open("a+b") as printed:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        words = [sys.executable, program, rollout, str(cores), file]
+        done = subprocess.run(words, env=environment, stdout=printed, stderr=subprocess.PIPE, timeout=300)
+    assert done.returncode == 0, done.stderr.decode()
+    said = pickle.loads(file.read_bytes())
+    for number, (constants, (compile_s, answers, most_s, text)) in enumerate(
+        zip(runs_of_one_actor(rollout), said, strict=True)
+    ):
+        (results, report, first_s), (again, _, second_s) = answers
+        assert (compile_s == 0.0) == (number == 1), "whose constants are those of the first, whatever the seed"
+        expected = list(map(bits, make_worker(constants)(work())))
+        assert list(map(bits, results)) == list(map(bits, again)) == expected
+        assert text == report.printed.encode() + b"\n" == b"run %d\n" % number
+        assert bool(report.spent) == (number == 3)
+        assert first_s <= second_s
+        if number and rollout == "simd":  # children of xla compute, too
+            assert second_s <= most_s + 0.1
+
+
 def child_program(tmp_path, *arguments, program=PROGRAM):
     file = tmp_path / "program.py"
     file.write_text(textwrap.dedent(program))
@@ -161,8 +228,6 @@ def child_program(tmp_path, *arguments, program=PROGRAM):
 
 @pytest.mark.slow
 def test_child_processes_with_xla_give_the_results_of_one_core(tmp_path):
-    import pickle
-
     done = child_program(tmp_path)
     assert done.returncode == 0, done.stderr.decode()
     alone = make_worker(spec(rollout="xla", episode_steps=30))(work())
