@@ -191,9 +191,9 @@ class _EchoSpec(WorkerSpec):
 class EchoActor(WorkerActor):
     """A worker that computes for SPIN_S and gives each chunk the recorded answer of its kind."""
 
-    def build(self) -> str:
+    def build(self, given: bytes | None = None) -> str:
         """As `WorkerActor.build`, without the code of a task."""
-        spec: _EchoSpec = pickle.loads(self._spec)
+        spec: _EchoSpec = pickle.loads(given or self._spec)
 
         def echo(work: Sequence[Work]) -> list[ChunkResult]:
             until = time.perf_counter() + SPIN_S
