@@ -57,6 +57,7 @@ from workers.compiling import Compilable
 from workers.cores import parts
 from workers.policies.policy import initial_parameters
 from workers.reports import Reports
+from workers.worker import Made
 
 MEASURE_S = 1.0
 """Time for the measurement of each kind of chunk."""
@@ -202,7 +203,7 @@ class EchoActor(WorkerActor):
             return [spec.answers[_kind(one)] for one in work]
 
         self._received, self._reports = Received(spec.parent_cache_bytes, Recipes.made), Reports(spec, self._cores)
-        self._run_chunks = Compilable(echo, lambda work: None)
+        self._made = Made(Compilable(echo, lambda work: None), set())
         return platform_text({})
 
 

@@ -125,7 +125,8 @@ def test_of_what_a_simulator_prints_the_newest_is_kept_and_told_when_its_worker_
         while os.fstat(log).st_size > 75_000:
             assert time.monotonic() < patience_s, "8 MB were printed"
             time.sleep(0.02)
-        assert re.search(r"joint limit reached\nstep \d+ is done$", engine.transport.kill(0))
+        # Not at its end: a line that is written while the file is cut may come before older ones.
+        assert re.search(r"joint limit reached\nstep \d+ is done\n?", engine.transport.kill(0))
 
 
 @pytest.mark.parametrize(
