@@ -98,7 +98,7 @@ class FromZero(Still):
         return state
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_descriptor_that_is_the_same_in_all_episodes_is_noted_also_by_a_run_that_needs_it(tmp_path, one_process):
     def told(search, generations=21, environment=f"{__name__}:Still"):
         notices: list[str] = []

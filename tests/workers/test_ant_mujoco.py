@@ -255,7 +255,7 @@ def test_no_ant_gets_through_a_wall(task: str):
     check_torsos(np.array(nearest))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @ONE_TASK
 def test_replays_show_the_bodies_and_the_walls_as_high_as_those_of_springs(task: str):
     environment = make_environment(task, {"physics": "mujoco"})

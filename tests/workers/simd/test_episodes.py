@@ -118,7 +118,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
         jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
     environment, worker_spec = make_environment("ant_trap", {}), few_steps("ant_trap")
     zero_O = rollout.always_zero(environment)

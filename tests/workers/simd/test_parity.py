@@ -98,7 +98,7 @@ def moved(inputs: Any, rng: np.random.Generator, by: float | None) -> Any:
     [
         ("point_maze", 1000),
         pytest.param("brax:inverted_double_pendulum", 256, marks=pytest.mark.slow),
-        pytest.param("ant_maze", 256, marks=pytest.mark.slow),
+        pytest.param("ant_maze", 256, marks=pytest.mark.long),
         pytest.param("ant_trap", 256, marks=pytest.mark.long),
         *(pytest.param(name, 1000, marks=pytest.mark.long) for name in ("ant_maze", "ant_trap")),
         *(

@@ -59,7 +59,7 @@ def words_of(tree) -> np.ndarray:
         ("point_maze", False),
         ("point_maze", True),
         pytest.param("ant_trap", False, marks=pytest.mark.long),
-        pytest.param("ant_trap", True, marks=pytest.mark.slow),
+        pytest.param("ant_trap", True, marks=pytest.mark.long),
     ],
 )
 def test_steps_of_single_lanes_have_the_bits_of_kernels(task: str, quick: bool, one: Target) -> None:
