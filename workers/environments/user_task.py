@@ -27,6 +27,8 @@ A class with a model of MuJoCo has less to say, see `mujoco_task.py`. It may als
 - if the descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, the
   least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
   and `goal`, a place (x, y). Reports draw both;
+- `goal_places`, a mapping from values of the option `goal` to the descriptor of an episode that ends there, and
+  `goal_radius`, how far from it an episode has still reached it, for `es-service polish --goals`;
 - `viewer(self)`, if the task has bodies: a `workers.viewer.Viewer`, with which reports replay episodes in three
   dimensions. `workers.environments.ant.make_ant(...).viewer` is that of an ant;
 - `least_reward`: the reward per step from which QD-scores are counted;
