@@ -301,7 +301,8 @@ def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> 
         ConfigError: lists every problem found. NotInRunError: the run has no finished generation.
     """
     overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
-    return load_config(polish_source(open_run(parent), overrides), overrides, name=str(open_run(parent).config_file))
+    run = open_run(parent)
+    return load_config(polish_source(run, overrides), overrides, name=str(run.config_file))
 
 
 def polish_source(run: Run, overrides: Overrides, share: int = 1) -> dict[str, Any]:
