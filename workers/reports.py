@@ -22,6 +22,7 @@ PRINTED_BYTES = 2000
 """At most this many bytes of what is new are told at a time: the newest."""
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 """What colours the text of a terminal, among other things."""
+LINE_END = re.compile(rb"[\r\n]")
 LOOK_S = 0.5
 """Seconds between two looks at the memory."""
 
@@ -48,13 +49,19 @@ class Tail:
         return self._file >= 0
 
     def new(self, most_bytes: int = PRINTED_BYTES) -> str:
-        """What was written since the last call, the newest part of it: printable lines."""
+        """What was written since the last call, the newest part of it: printable lines. If there is more, it begins
+        with the first whole line, if there is one."""
         if self._file < 0:
             return ""
         size = os.fstat(self._file).st_size
-        first = max(self._at if self._at <= size else 0, size - most_bytes)  # a smaller file was cut
+        known = self._at if self._at <= size else 0  # a smaller file was cut
+        first = max(known, size - most_bytes)
         self._at = size
-        return printable(os.pread(self._file, size - first, first))
+        if first == known:
+            return printable(os.pread(self._file, size - first, first))
+        with_end_before = os.pread(self._file, size - first + 1, first - 1)
+        end = LINE_END.search(with_end_before, 0, len(with_end_before) - 1)
+        return printable(with_end_before[end.end() if end else 1 :])
 
     def skip(self) -> None:
         """Leave out what was written until now."""

@@ -184,8 +184,12 @@ def _of(process: int) -> NewestOutput:
 
 
 def cut(descriptor: int, most_bytes: int) -> int:
-    """Take away the beginning of a file that others append to; returns how many bytes are left."""
-    newest = os.pread(descriptor, most_bytes, max(0, os.fstat(descriptor).st_size - most_bytes))
+    """Take away the beginning of a file that others append to, up to the end of a line; returns how many bytes are
+    left."""
+    first = max(0, os.fstat(descriptor).st_size - most_bytes)
+    newest = os.pread(descriptor, most_bytes, first)
+    if first:
+        newest = newest[newest.find(b"\n") + 1 :]  # all of it, if it has no end of a line
     os.ftruncate(descriptor, 0)
     os.write(descriptor, newest)
     return len(newest)

@@ -40,9 +40,15 @@ def test_of_a_file_the_newest_lines_are_read_once_also_after_its_beginning_was_c
         assert (tail.new(), tail.new()) == ("one\ntwo", "")
         file.write(b"".join(b"%4d\n" % number for number in range(1000)))
         assert tail.new(10) == " 998\n 999"
+        file.write(b"a long line\nthe next\n")
+        assert tail.new(14) == "the next"
+        file.write(b"a line that does not end")
+        assert tail.new(3) == "end"
+        file.write(b"\n")
+        assert tail.new() == ""
         cut(file.fileno(), 100)
         file.write(b"after\n")
-        assert tail.new().endswith(" 999\nafter")
+        assert tail.new().endswith("not end\nafter")
         tail.close()
         file.write(b"late\n")
         assert tail.new() == ""
