@@ -10,12 +10,11 @@ import pickle
 import re
 import socket
 from contextlib import suppress
-from multiprocessing import active_children
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from es_service.protocol.machine import cpu_seconds, platform_info, platform_text
+from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
 from es_service.protocol.sent import LackingError, Received
@@ -86,15 +85,15 @@ class WorkerActor:
             OtherCodeError: this host must not work for the run: it has other code than the driver, or another platform
                 than the run's.
         """
-        spec, is_new = pickle.loads(given or self._spec), self._of_all is None
-        if is_new:
+        spec, earlier = pickle.loads(given or self._spec), self._of_all
+        if earlier is None:
             for descriptor in (1, 2):  # Ray has a file for each of the two
                 with suppress(OSError):  # a Ray that takes the output through a pipe has limits of its own
                     self._watched.append(newest_output().add(descriptor, spec.output_bytes // 2))
             with suppress(OSError):
                 remove_old_logs(Path(os.readlink("/proc/self/fd/1")))
         else:
-            self._before_s = seconds_so_far()
+            self._before_s = earlier.cpu_s
             for file in self._watched:
                 os.ftruncate(file, 0)
         if problem := why_refused(spec.sources, spec.task_code, spec.platform):
@@ -111,9 +110,9 @@ class WorkerActor:
         self._received = Received(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(*self._task_code):
             self._reports = reports_of(spec, self._cores, before=self._reports)
-            self._of_all = self._of_all or Cores(self._cores)
+            self._of_all = earlier or Cores(self._cores)
             self._made = self._of_all.made(spec)
-            if is_new:
+            if earlier is None:
                 require_room(spec, self._cores)
         return platform_of_gpu(spec.rollout) or platform_text(platform_info())
 
@@ -136,6 +135,7 @@ class WorkerActor:
         """
         assert self._made is not None, "run was called before build"
         assert self._reports is not None, "build makes them, too"
+        assert self._of_all is not None, "build makes them, too"
         with sendable(*self._task_code):
             try:
                 with self._turn:
@@ -143,7 +143,7 @@ class WorkerActor:
             except LackingError:
                 return pickle.dumps(None)
             self._reports.note(results := self._made.run_chunks(work))
-            seconds = seconds_so_far() - self._before_s
+            seconds = self._of_all.cpu_s - self._before_s
             return pickle.dumps((results, self._reports.report(), seconds), pickle.HIGHEST_PROTOCOL)
 
     def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
@@ -153,11 +153,6 @@ class WorkerActor:
         for named in (small, *map(pickle.loads, arrays)):
             self._received.add(named)
         return self._received.work(origins, work)
-
-
-def seconds_so_far() -> float:
-    """Seconds of processors that this process has used, and those of its cores."""
-    return cpu_seconds(child.pid for child in active_children() if child.pid is not None)
 
 
 def remove_old_logs(own: Path) -> None:

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
+from concurrent.futures import Executor, ThreadPoolExecutor, wait
+from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from es_service.protocol.child import end_with
+from es_service.protocol.child import Child, NoAnswerError
 from es_service.protocol.gradient_tree import with_neighbours_added
+from es_service.protocol.machine import cpu_seconds
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec, recipes_in
+from es_service.protocol.process_environment import same_imports
 from es_service.protocol.user_code import sendable
 from workers import progress
 from workers.compiling import Compilable
@@ -29,23 +30,6 @@ from workers.worker import Made, compiled_before, made_before
 PARTS_PER_CORE = 2
 """Parts of a work item for each core, so that a core that finishes early takes over a part of another one."""
 AnyWork = TypeVar("AnyWork")
-
-
-@dataclass
-class _Child:
-    """What a child process has."""
-
-    barrier: Any
-    """Barrier of all children of the worker."""
-    before: dict[str, Any] = field(default_factory=dict)
-    """See `compiled_before`."""
-    worker: Compilable | None = None
-    task_code: tuple[str, ...] = ()
-    """The name of the task."""
-
-
-_child: _Child | None = None
-"""Set in a child process, by `_begin_child`."""
 
 
 class Cores:
@@ -59,6 +43,10 @@ class Cores:
         """Start nothing yet."""
         self._cores, self._before = cores, dict[str, Any]()
         self._pool: Executor | None = None
+        self._of_thread, self._turn = threading.local(), threading.Lock()
+        self.children: list[Child] = []
+        """One for each core, once work has begun that does not run in threads."""
+        self._barrier = threading.Barrier(cores)
 
     def made(self, spec: WorkerSpec) -> Made:
         """What computes the chunks of a run, as `make_worker` makes it for one core."""
@@ -68,23 +56,78 @@ class Cores:
             worker, compiled = compiled_before(self._before, spec)
             self._pool = pool = self._pool or ThreadPoolExecutor(self._cores)
             return Made(Compilable(lambda work: divided(pool, worker.run, work, self._cores), worker.compile), compiled)
-        self._pool = pool = self._pool or self._children()
-        _together(pool, _make_in_child, [(spec,)] * self._cores)  # from now on there is a child for each core
+        self._pool = pool = self._pool or self._with_children()
+        together(pool, partial(self._in_each, "make"), [(spec,)] * self._cores)
 
         def run(work: Sequence[Work]) -> list[ChunkResult]:
             with progress.call() as call:
-                return divided(pool, partial(_run_child, call), with_made_policies(work), self._cores)
+                return divided(pool, partial(self._in_one, "run", call), with_made_policies(work), self._cores)
 
-        def compile_in_children(work: Sequence[Work]) -> None:
+        def compile_in_each(work: Sequence[Work]) -> None:
             with progress.call() as call:
-                _together(pool, _compile_in_child, [(call, with_made_policies(work))] * self._cores)
+                given = call, with_made_policies(work)
+                together(pool, partial(self._in_each, "compile"), [given] * self._cores)
 
-        return Made(Compilable(run, compile_in_children), made_before(self._before, spec, lambda _: set[str]()))
+        return Made(Compilable(run, compile_in_each), made_before(self._before, spec, lambda _: set[str]()))
 
-    def _children(self) -> Executor:
-        context = get_context("spawn")  # a forked JAX would not work
-        given = (os.getpid(), context.Barrier(self._cores), progress.shared_rows(context, self._cores))
-        return ProcessPoolExecutor(self._cores, context, _begin_child, given)
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of processors that this process has used, and those of its children."""
+        return cpu_seconds(child.pid for child in self.children)
+
+    def _with_children(self) -> Executor:
+        """Threads each of which has a child process."""
+        rows = progress.shared_rows(self._cores)
+
+        def begin() -> None:
+            with self._turn:
+                number = len(self.children)
+                # It prints where this process does.
+                self._of_thread.child = Child("workers.cores:core", os.environ | same_imports(), output_bytes=None)
+                self.children.append(self._of_thread.child)
+            self._in_one("", rows, number)
+
+        return ThreadPoolExecutor(self._cores, initializer=begin)
+
+    def _in_one(self, *request: Any) -> Any:
+        """The answer of this thread's child."""
+        try:
+            return self._of_thread.child.call(*request)
+        except NoAnswerError as error:
+            print(f"a child process of this worker has {error}", file=sys.stderr, flush=True)
+            os._exit(1)
+
+    def _in_each(self, *request: Any) -> None:
+        """Have one of as many requests as there are children answered: each by another child."""
+        try:
+            self._in_one(*request)
+        finally:
+            self._barrier.wait()
+
+
+def core(name: str, rows: str, number: int) -> Callable[..., Any]:
+    """What a child process answers: see `answer_parent`. It has no task of its own before "make"."""
+    progress.use_row(rows, number)
+    before: dict[str, Any] = {}
+    worker: Compilable | None = None
+    task_code: tuple[str, ...] = ()
+
+    def answer(what: str, *given: Any) -> Any:
+        nonlocal worker, task_code
+        if what == "make":
+            (spec,) = given
+            task_code = spec.task_code
+            progress.belongs_to(0)  # to no call, as while the worker starts
+            with sendable(*task_code):
+                worker = compiled_before(before, spec).run_chunks
+            return None
+        call, work = given
+        assert worker is not None, "it is made for each run"
+        progress.belongs_to(call)
+        with sendable(*task_code):
+            return worker.compile(work) if what == "compile" else worker(work)
+
+    return answer
 
 
 def with_made_policies(work: Sequence[Work]) -> list[Work]:
@@ -100,19 +143,15 @@ def with_made_policies(work: Sequence[Work]) -> list[Work]:
 
 def divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:
     """Run the parts of a work item side by side."""
-    results = _together(pool, run, [(part,) for part in parts(work, cores)])
+    results = together(pool, run, [(part,) for part in parts(work, cores)])
     return with_neighbours_added(work, [result for part in results for result in part])
 
 
-def _together(pool: Executor, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+def together(pool: Executor, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Results of calls that run side by side, in their order."""
-    try:
-        futures = [pool.submit(function, *given) for given in arguments]
-        wait(futures)  # also if one has failed, or the others would compete with the next work item
-        return [future.result() for future in futures]
-    except BrokenProcessPool as error:
-        print(f"a child process of this worker has ended: {error}", file=sys.stderr, flush=True)
-        os._exit(1)
+    futures = [pool.submit(function, *given) for given in arguments]
+    wait(futures)  # also if one has failed, or the others would compete with the next work item
+    return [future.result() for future in futures]
 
 
 def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
@@ -123,47 +162,3 @@ def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
     count = min(len(work), cores * PARTS_PER_CORE if len(work) >= 2 * cores * PARTS_PER_CORE else cores)
     ends = [len(work) * (index + 1) // count for index in range(count)]
     return [work[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-
-
-def _begin_child(parent: int, barrier: Any, rows: tuple[Any, Any]) -> None:
-    """Prepare a child process, which ends with its parent."""
-    global _child
-    end_with(parent)
-    progress.use_row(*rows)
-    _child = _Child(barrier)
-
-
-def _make_in_child(spec: WorkerSpec) -> None:
-    """Make what computes the chunks of a run."""
-    assert _child is not None, "the pool initialises each child"
-    progress.belongs_to(0)  # to no call, as while the worker starts
-    try:
-        with sendable(*spec.task_code):
-            _child.worker, _child.task_code = compiled_before(_child.before, spec).run_chunks, spec.task_code
-    finally:
-        _meet()
-
-
-def _meet() -> None:
-    """Wait for the other children, so that each runs one of as many calls as there are children."""
-    assert _child is not None, "the pool initialises each child"
-    _child.barrier.wait()
-
-
-def _compile_in_child(call: int, work: Sequence[Work]) -> None:
-    assert _child is not None, "the pool initialises each child"
-    assert _child.worker is not None, "it is made for each run"
-    progress.belongs_to(call)
-    try:
-        with sendable(*_child.task_code):
-            _child.worker.compile(work)
-    finally:
-        _meet()
-
-
-def _run_child(call: int, work: Sequence[Work]) -> list[ChunkResult]:
-    assert _child is not None, "the pool initialises each child"
-    assert _child.worker is not None, "it is made for each run"
-    progress.belongs_to(call)
-    with sendable(*_child.task_code):
-        return _child.worker(work)

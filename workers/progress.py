@@ -7,16 +7,18 @@ the work. A worker whose cores are child processes reads the rows of all of them
 
 from __future__ import annotations
 
+import mmap
+import os
 from collections.abc import Hashable, Iterator, MutableSequence, Sequence
 from contextlib import contextmanager
 from itertools import count
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 Thing = TypeVar("Thing")
 MOVES, DOING, DONE, TOTAL, CALL = range(5)
 """Numbers of a row: how often something was done, what is done with environments before their first step, with how many
 of how many, and the call of the worker that this belongs to."""
-SIZE = 5
+SIZE, NUMBER_BYTES = 5, 8
 DOINGS = ("", "making", "resetting")
 """Values of DOING, in words."""
 
@@ -71,28 +73,25 @@ def seen() -> Seen:
     return Seen(moves, DOINGS[doing], done, total)
 
 
-def shared_rows(context: Any, cores: int) -> tuple[Any, Any]:
-    """Rows for child processes, which `seen` reads from now on; what `use_row` needs in each child.
-
-    Args:
-        context: of `multiprocessing`.
-    """
-    memory, next_row = context.RawArray("q", SIZE * cores), context.Value("i", 0)
-    _rows[:] = [_row(memory, core) for core in range(cores)]
-    return memory, next_row
+def shared_rows(cores: int) -> str:
+    """Rows for child processes, which `seen` reads from now on; the file in memory where `use_row` finds them. It stays
+    as long as this process."""
+    file, size = os.memfd_create("progress"), NUMBER_BYTES * SIZE * cores
+    os.ftruncate(file, size)
+    _rows[:] = [_row(mmap.mmap(file, size), core) for core in range(cores)]
+    return f"/proc/{os.getpid()}/fd/{file}"
 
 
-def use_row(memory: Any, next_row: Any) -> None:
-    """Take the next of the rows as that of this process."""
+def use_row(file: str, core: int) -> None:
+    """Take the row of a core as that of this process."""
     global _own
-    with next_row.get_lock():
-        core, next_row.value = next_row.value, next_row.value + 1
-    _own = _row(memory, core)
+    with open(file, "r+b") as opened:
+        _own = _row(mmap.mmap(opened.fileno(), 0), core)
     _rows[:] = [_own]
 
 
-def _row(memory: Any, core: int) -> memoryview:
-    return memoryview(memory).cast("B").cast("q")[SIZE * core : SIZE * (core + 1)]
+def _row(memory: mmap.mmap, core: int) -> memoryview:
+    return memoryview(memory).cast("q")[SIZE * core : SIZE * (core + 1)]
 
 
 @contextmanager

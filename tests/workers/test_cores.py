@@ -59,17 +59,15 @@ if __name__ == "__main__":
     from tests.workers.test_worker import work
     from workers.cores import Cores
 
-    run = Cores(2).made(spec(rollout="xla", episode_steps=30)).run_chunks
+    cores = Cores(2)
+    run = cores.made(spec(rollout="xla", episode_steps=30)).run_chunks
     run.compile(work())  # in each child
     results = run(work())
     if len(sys.argv) > 1:
-        import multiprocessing
-        children = multiprocessing.active_children()
-        print(*(child.pid for child in children), flush=True)
+        print(*(child.pid for child in cores.children), flush=True)
         if sys.argv[1] == "end":
             os.kill(os.getpid(), 9)
-        os.kill(children[0].pid, 9)
-        children[0].join()
+        os.kill(cores.children[0].pid, 9)
         run(work())
     sys.stdout.buffer.write(pickle.dumps(results))
 """
