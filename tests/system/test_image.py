@@ -107,10 +107,10 @@ class Containers:
             started = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         self._started.append(started)
 
-    def healthy(self) -> bool:
-        """Whether compose.yaml's check of the head passes."""
-        check = self.services["head"]["healthcheck"]["test"][1:]
-        return subprocess.run(self.command("head", *check), capture_output=True, check=False).returncode == 0
+    def healthy(self, service: str) -> bool:
+        """Whether compose.yaml's check of a service passes."""
+        check = self.services[service]["healthcheck"]["test"][1:]
+        return subprocess.run(self.command(service, *check), capture_output=True, check=False).returncode == 0
 
     def run(self, service: str, *command: str) -> str:
         return sh(*self.command(service, *command))
@@ -124,8 +124,9 @@ def test_two_containers_run_a_job(image, tmp_path):
     with Containers(tmp_path) as containers:
         assert containers.run("head", "id", "--user").strip() == "1000"
         containers.start("head")
-        wait_for(containers.healthy, timeout_s=120)
+        wait_for(lambda: containers.healthy("head"), timeout_s=120)
         containers.start("worker")
+        wait_for(lambda: containers.healthy("worker"), timeout_s=120)
         wait_for(
             lambda: containers.run("head", "ray", "status", f"--address={HEAD}").count("node_") == 2, timeout_s=120
         )

@@ -145,11 +145,13 @@ def test_only_rays_pods_and_the_operator_reach_rays_pods():
 def test_containers_of_compose_are_limited_and_their_token_is_a_file():
     compose = yaml.safe_load((DOCKER / "compose.yaml").read_text())
     assert compose["secrets"] == {"token": {"environment": "TOKEN"}}
+    checks = {name: service["healthcheck"]["test"] for name, service in compose["services"].items()}
+    assert checks["head"] == ["CMD", "ray", "health-check"]
+    assert "http://127.0.0.1:" in checks["worker"][3], "a worker answers for its own raylet, and not for the head"
     for service in compose["services"].values():
         assert service["environment"] == {"RAY_AUTH_TOKEN_PATH": "/run/secrets/token"}
         assert service["secrets"] == ["token"]
         assert service["restart"] == "unless-stopped"
-        assert service["healthcheck"]["test"][:3] == ["CMD", "ray", "health-check"]
         assert service["deploy"]["resources"]["limits"]["memory"]
         assert service["cap_drop"] == ["ALL"]
         assert service["security_opt"] == ["no-new-privileges:true"], "as allowPrivilegeEscalation: false says it"
