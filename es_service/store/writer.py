@@ -283,8 +283,11 @@ class RunStore:
         with self._transaction("storing a certification") as connection:
             put_meta(connection, SCHEMA, str(EXTENDED_SCHEMA))
             insert_contents(connection, ((name, contents[name]) for name in added))
+            self._hook("mid_transaction")
             insert_certification(connection, number, policies)
+            self._hook("before_commit")
         self._kept.add_named(named)
+        self._hook("after_commit")
         self.upkeep.after_commit()
 
     def record_metrics(self, generation: int, named: Mapping[str, float]) -> None:

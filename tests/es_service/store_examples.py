@@ -94,6 +94,12 @@ OTHER = {"parameters_D": np.arange(40, dtype=np.float32)}
 """A policy that no state names, but a certification may."""
 
 
+def certified(*contents):
+    """A certification of policies: their rows, and the policies by name."""
+    rows = [({}, {"policy": names([name_of(content)]).reshape(())}) for content in contents]
+    return rows, {name_of(content): content for content in contents}
+
+
 def contents_of(generation, seed=0):
     """What a generation's parts name, as far as they are new."""
     content = policy(generation, seed)

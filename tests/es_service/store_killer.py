@@ -12,7 +12,7 @@ from pathlib import Path
 from es_service.store import upkeep as store_upkeep
 from es_service.store import writer as store
 from es_service.store.writer import RunStore
-from tests.es_service.store_examples import advance, create
+from tests.es_service.store_examples import OTHER, advance, certified, create, policy
 
 GENERATIONS = 6
 EVENTS = ("open", "mkdir", "os.rename", "os.remove", "shutil.copyfile", "sqlite3.connect")
@@ -72,6 +72,10 @@ def main():
             elif job == "open":
                 die_at_file_operation(int(count))
                 RunStore.open(folder).close()
+            elif job == "certify":
+                store_upkeep.CHECKPOINT_INTERVAL_S = 0.0
+                with RunStore.open(folder, hook=killed_at(instant, int(count))) as run:
+                    run.add_certification(*certified(OTHER, policy(0)))
             os._exit(0)
         _, status = os.waitpid(child, 0)
         print(name, "killed" if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL else status)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.protocol.content import name_of, names, names_in
+from es_service.protocol.content import name_of, names_in
 from es_service.store import repair
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
@@ -34,6 +34,7 @@ from tests.es_service.store_examples import (
     assert_same_history,
     assert_same_state,
     assert_sound,
+    certified,
     contents_of,
     copy_at_every_commit,
     create,
@@ -241,12 +242,6 @@ def test_a_damaged_index_of_the_contents_is_noticed_and_made_again(tmp_path):
         assert_sound(folder, 5)
         assert digest(folder) == uninterrupted
     assert len(places) > 2, "the policy, its index, and the blocks that name it"
-
-
-def certified(*contents):
-    """A certification of policies: their rows, and the policies by name."""
-    rows = [({}, {"policy": names([name_of(content)]).reshape(())}) for content in contents]
-    return rows, {name_of(content): content for content in contents}
 
 
 def test_a_certified_policy_stays_while_no_state_names_it(tmp_path):

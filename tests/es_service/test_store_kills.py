@@ -9,19 +9,23 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
+from es_service.protocol.content import name_of
 from es_service.store import reader
 from es_service.store import writer as store
-from es_service.store.reader import read_generation, read_history
+from es_service.store.reader import read_certifications, read_generation, read_history
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
+    OTHER,
     advance,
     assert_same_history,
     assert_same_state,
     assert_sound,
+    certified,
     copy_at_every_commit,
     create,
     digest,
     finished,
+    policy,
     state_at,
 )
 from tests.es_service.store_killer import GENERATIONS
@@ -127,6 +131,28 @@ def test_a_repair_killed_at_any_file_operation_can_be_done_again(tmp_path, monke
         assert (tmp_path / name / "run.db.damaged").exists()
         assert not list((tmp_path / name).glob("run.db.restored*"))
         assert_sound(tmp_path / name, 2)
+
+
+@pytest.mark.slow
+def test_of_a_certification_that_was_killed_there_is_all_or_nothing(tmp_path):
+    hooks = ("mid_transaction", "before_commit", "after_commit", "before_checkpoint", "after_checkpoint")
+    create(tmp_path / "whole", generations=2).close()
+    for hook in hooks:
+        shutil.copytree(tmp_path / "whole", tmp_path / hook)
+    assert killed(tmp_path, [("certify", hook, hook, 1) for hook in hooks]) == {*hooks}
+    for number, hook in enumerate(hooks):
+        is_stored = number >= 2
+        with RunStore.open(tmp_path / hook) as run:
+            assert run.next_certification == is_stored
+            assert run.notices == []
+            for _ in range(2 - is_stored):
+                run.add_certification(*certified(OTHER, policy(0)))
+        found = read_certifications(tmp_path / hook)
+        assert [(row.number, row.rank, [*row.contents]) for row in found] == [
+            (number, rank, [name_of(content)]) for number in (0, 1) for rank, content in enumerate((OTHER, policy(0)))
+        ]
+        assert_sound(tmp_path / hook, 1)
+        assert digest(tmp_path / hook) == digest(tmp_path / "whole")
 
 
 def test_on_a_network_a_killed_writer_loses_no_more(tmp_path, monkeypatch):
