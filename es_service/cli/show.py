@@ -35,13 +35,14 @@ from es_service.cli.status import follow_status, print_status
 from es_service.config.given import first_sentence, shipped_configs, shipped_text
 from es_service.config.keys import SECTIONS, unknown_key
 from es_service.config.search import PRESETS, preset_table
-from es_service.config.tasks import TASKS
-from es_service.config.text import did_you_mean, nearest, show
+from es_service.config.tasks import TASKS, tasks_of_suite
+from es_service.config.text import did_you_mean, nearest, one_of, show
 from es_service.config.values import DescribedKey, described_keys, methods_words
 from es_service.errors import ConfigError, ServiceError
 from es_service.protocol.machine import given_path
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
+from es_service.protocol.sources import SUITES
 from es_service.report.progress import short
 from es_service.runs.run_status import (
     Recent,
@@ -239,12 +240,35 @@ def keys_page(rows: Iterable[DescribedKey]) -> str:
     return "\n".join(parts)
 
 
-def list_(as_json: JsonOption = False) -> None:
-    """Show tasks, algorithms, presets and shipped configs."""
-    if as_json:
+def list_(
+    suite: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help=f"Show the environments of an installed suite: {', '.join(SUITES)}."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show tasks, algorithms, presets and shipped configs, or the environments of a suite."""
+    if suite is not None:
+        list_suite(suite, as_json)
+    elif as_json:
         print_json(catalogue_data(TASKS))
     else:
         print_catalogue(console, TASKS)
+
+
+def list_suite(suite: str, as_json: bool) -> None:
+    """Print the environments of a suite with their sizes, each as soon as it is known."""
+    if suite not in SUITES:
+        hint = did_you_mean(suite, SUITES)
+        raise ConfigError(f"--suite {suite}: there is no such suite; must be {one_of(SUITES)}{hint}")
+    rows = []
+    for name, task in tasks_of_suite(suite):
+        rows.append(asdict(task) if isinstance(task, TaskSpec) else {"name": name, "problem": task})
+        if not as_json:
+            print_line(console, name, style="bold")
+            console.print(Padding(task if isinstance(task, str) else _about(task), (0, 0, 0, 4)))
+    if as_json:
+        print_json(rows)
 
 
 def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
@@ -254,8 +278,8 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
         tasks.add_row(task.name, _about(task))
     tasks.add_row("brax:NAME", "any environment of the installed Brax")
     tasks.add_row("mujoco:ID", "an environment of Gymnasium by MJX, such as mujoco:Ant-v5")
-    tasks.add_row("gymnax:NAME", "an environment of gymnax 1.0, such as gymnax:CartPole-v1")
-    tasks.add_row("playground:NAME", "an environment of MuJoCo Playground 0.2, such as playground:CartpoleBalance")
+    for name in SUITES:
+        tasks.add_row(f"{name}:NAME", f"an environment of {name}; {command('list', '--suite', name)} shows them")
     tasks.add_row("gymnasium:ID", "an environment of Gymnasium, with Box or Discrete spaces")
     tasks.add_row("module:Class", "a task of your own in JAX; see workers/own_tasks.md")
     tasks.add_row("python:module:Class", "a task of your own in Python: an object with reset and step")

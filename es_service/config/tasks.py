@@ -38,7 +38,7 @@ from es_service.protocol.options import (
 )
 from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
 from es_service.protocol.rollouts import Rollouts
-from es_service.protocol.sources import task_code, user_sources
+from es_service.protocol.sources import SUITES, task_code, user_sources
 from es_service.protocol.user_code import RaisedError
 from workers import environments
 from workers.rollouts import BACKENDS
@@ -83,8 +83,8 @@ def caller_task(options: Mapping[str, OptionValue]) -> TaskSpec:
 CHOICES = ("task.descriptor", "task.success", "task.new_object_each_episode", "task.metrics")
 """Keys of `HostChoices`."""
 OTHER_TASKS = (
-    "brax:NAME, mujoco:ID, gymnasium:ID, gymnax:NAME, playground:NAME, python:module:Class, function:module:name, or "
-    "module:Class"
+    f"brax:NAME, mujoco:ID, gymnasium:ID, {', '.join(f'{suite}:NAME' for suite in SUITES)}, python:module:Class, "
+    "function:module:name, or module:Class"
 )
 """Names of tasks that are not shipped, in words."""
 DESCRIBE_S = 300.0
@@ -198,6 +198,29 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
         named = re.match(r"(task\.(?:\w+|options\.\w+)) = ", problem)
         raise ConfigError(problem, field=named and named[1])
     return task_from_fields(answer["task"])
+
+
+def tasks_of_suite(suite: str) -> Iterator[tuple[str, TaskSpec | str]]:
+    """Name of each environment of a suite, and its description, or why it cannot be a task.
+
+    Args:
+        suite: one of `sources.SUITES`.
+
+    Raises:
+        ConfigError: the suite is not installed, or its process ended.
+    """
+    with Child("workers.describe:members", child_environment()) as child:
+        try:
+            child.call(suite, limit_s=DESCRIBE_S)
+            listed = json.loads(child.call("", limit_s=DESCRIBE_S))
+            if "problem" in listed:
+                raise ConfigError(listed["problem"])
+            for name in listed["names"]:
+                answer = json.loads(child.call(name, limit_s=DESCRIBE_S))
+                yield f"{suite}:{name}", answer.get("problem") or task_from_fields(answer["task"])
+        except (NoAnswerError, RaisedError) as error:
+            raise ConfigError(f"the environments of {suite} could not be described: {error}") from None
+        child.end(END_S)
 
 
 _TASK = TypeAdapter(TaskSpec)

@@ -36,8 +36,9 @@ DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
 PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
-SUITES = ("gymnax", "playground")
-"""Packages of environments in JAX, such as `gymnax:CartPole-v1`, by their names on the package index."""
+SUITES = ("craftax", "gymnax", "jumanji", "kheperax", "playground")
+"""Packages of environments in JAX, such as `gymnax:CartPole-v1`, by their names on the package index, which are also
+those of our extras."""
 VERSIONED = {**{suite: (suite,) for suite in SUITES}, "evosax": ("evosax", "optax")}
 """Kind of the names of tasks, and of searches such as `evosax:CMA_ES`, that a library defines -> packages whose
 versions are recorded in the place of the hashes of their files."""
@@ -56,7 +57,10 @@ SHARED_FOLDERS = ("site-packages", "dist-packages")
 
 def task_code(environment: str, descriptor: object, options: Mapping[str, object]) -> tuple[str, ...]:
     """What a task's config says that names files that are none of ours: the task, a descriptor that is
-    `module:function`, and `mujoco:` if the options choose a model of MuJoCo for one of our tasks."""
+    `module:function`, which is an option of a suite's task, and `mujoco:` if the options choose a model of MuJoCo for
+    one of our tasks."""
+    if environment.partition(":")[0] in SUITES:
+        descriptor = options.get("descriptor")
     named = isinstance(descriptor, str) and ":" in descriptor
     modelled = ":" not in environment and options.get("physics") == MODELS
     return (environment, *((str(descriptor),) if named else ()), *((f"{MODELS}:",) if modelled else ()))

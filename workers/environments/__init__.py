@@ -87,8 +87,8 @@ SHIPPED: Mapping[str, TaskSpec] = {
 """Descriptions of the shipped tasks by name. A test compares each with the task's module."""
 SHIPPED_IN = {"point_maze": "point_maze", "ant_maze": "ant", "ant_trap": "ant"}
 """Task without a maze of cells -> the module with the function of its name that makes it."""
-ADAPTERS = {"brax": "brax_task", "mujoco": "mujoco_gym", **{suite: f"{suite}_task" for suite in SUITES}}
-"""Prefix of tasks in JAX from elsewhere -> the module that describes and makes them."""
+ADAPTERS = {"brax": "brax_task", "mujoco": "mujoco_gym"}
+"""Prefix of tasks in JAX from elsewhere -> the module that describes and makes them. For SUITES, it is `suite_task`."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,10 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
         return getattr(importlib.import_module(f"workers.environments.{SHIPPED_IN[name]}"), name)(**options)
     if prefix in ADAPTERS:
         return _adapter(prefix).make(rest, **options)
+    if prefix in SUITES:
+        from workers.environments import suite_task
+
+        return suite_task.make(name, options)
     from workers.environments import user_task
 
     return user_task.make(name, options)
@@ -236,6 +240,10 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
     options = settings.get("options", {})
     if kind in ADAPTERS:
         return _adapter(kind).describe(rest, options)
+    if kind in SUITES:
+        from workers.environments import suite_task
+
+        return suite_task.describe(name, options)
     if is_host_task(name):
         if kind == LIBRARY:
             from workers.environments import gymnasium_task

@@ -22,6 +22,8 @@ from es_service.protocol.user_code import import_user_module, in_no_file, users_
 from workers.environments import TaskError
 from workers.environments.host_task import HostEnvironment, HostEpisode, HostTask
 
+Described = tuple[tuple[str, ...], Bounds]
+"""Names and bounds of numbers of a descriptor."""
 TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the history": (
         ("centre_{}", "centre_{}_std"),
@@ -322,7 +324,7 @@ def with_descriptor(task: HostTask, choice: DescriptorChoice | None, size: int |
 
 def describe_descriptor(
     task: HostTask, choice: DescriptorChoice, bounds_O: Sequence[tuple[float, float]], action_size: int
-) -> tuple[tuple[str, ...], Bounds]:
+) -> Described:
     """(names, bounds) of the dimensions of a descriptor that a config chooses.
 
     Args:
@@ -341,19 +343,31 @@ def describe_descriptor(
         raise
     except Exception as error:  # the user's function can raise anything
         raise TaskError(f"task.descriptor = {choice}: {users_error(error, choice) or error}") from None
-    name = choice.rpartition(":")[2]
+    function = import_named(choice, "function") if ":" in choice else None
+    return dimensions(f"task.descriptor = {choice}", choice, size, function)
+
+
+def dimensions(where: str, name: str, size: int, function: Any = None) -> Described:
+    """Names and bounds of an array that is a descriptor, or a part of one.
+
+    Args:
+        where: what chooses it, for messages.
+        name: of the array, from which names are made; or `module:function`.
+        function: a function of the user's that computes it and may have `descriptor_names` and `descriptor_bounds`.
+
+    Raises:
+        TaskError: what the function declares does not fit, or a name is that of a column.
+    """
+    name = name.rpartition(":")[2]
     names = (name,) if size == 1 else tuple(f"{name}_{index}" for index in range(size))
-    bounds: Any = (UNBOUNDED,) * size
-    if ":" in choice:
-        function = import_named(choice, "function")
-        names = tuple(map(str, getattr(function, "descriptor_names", names)))
-        bounds = getattr(function, "descriptor_bounds", bounds)
+    names = tuple(map(str, getattr(function, "descriptor_names", names)))
+    bounds: Any = getattr(function, "descriptor_bounds", (UNBOUNDED,) * size)
     wrong = wrong_pairs("descriptor_bounds", bounds)
     if {len(names), len(bounds)} != {size}:
         wrong.append(f"{size} numbers, but {len(names)} descriptor_names and {len(bounds)} descriptor_bounds")
     wrong += clashes(names)
     if wrong:
-        raise TaskError(f"task.descriptor = {choice}: {'; '.join(wrong)}")
+        raise TaskError(f"{where}: {'; '.join(wrong)}")
     return names, tuple((float(low), float(high)) for low, high in bounds)
 
 

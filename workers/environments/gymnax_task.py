@@ -6,72 +6,42 @@ They are gymnax's own, by `reset_env` and `step_env`, which do not reset by them
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol.messages import Bounds, TaskSpec
-from es_service.protocol.options import Option, OptionValue
-from workers.environments import Environment, TaskError
-from workers.environments.brax_task import quietly
+from es_service.protocol.messages import Bounds
+from es_service.protocol.options import OptionValue
+from workers.environments import TaskError
 from workers.environments.declared import finite_bounds
-from workers.environments.suite_task import (
-    Actuators,
-    Choices,
-    Suite,
-    describe_suite,
-    make_suite,
-    require_known,
-    suite_package,
-)
+from workers.environments.suite_task import Actuators, Choices, Package, Suite, parameters_with, suite_module
 
-WAY = "pip install --no-deps gymnax==1.0.1 gymnasium (a few MB; without --no-deps it asks for an older gymnasium)"
+PACKAGE = Package(
+    "gymnax",
+    "it without its dependencies, of which it asks for an older gymnasium (a few MB):",
+    "pip install --no-deps gymnax==1.0.1 gymnasium",
+)
 LENGTH = "max_steps_in_episode"
 
 
 def names() -> tuple[str, ...]:
     """Names of the environments, those apart that download data when they are made."""
-    registered = suite_package("gymnax", WAY).registered_envs
+    registered = suite_module("gymnax", PACKAGE).registered_envs
     return tuple(name for name in registered if name != "MNISTBandit-bsuite")
 
 
-def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
-    """Description of gymnax's environment `name` as a task; `given` are values of options that are not the defaults.
+def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
+    """gymnax's environment `name`, with values of its parameters that are not the defaults.
 
     Raises:
-        TaskError: gymnax is not installed, has no such environment, or one that cannot be a task.
+        TaskError: its actions cannot be those of a task.
     """
-    environment, parameters = _made(name)
-    defaults = {
-        field.name: value
-        for field in dataclasses.fields(parameters)
-        if field.name != LENGTH and type(value := getattr(parameters, field.name)) in (bool, int, float)
-    }
-    options = {key: Option(value) for key, value in defaults.items()}
-    changed = parameters.replace(**{key: value for key, value in given.items() if key in defaults})
-    return describe_suite(_suite(name, environment, changed), options, given)
+    environment, defaults = suite_module("gymnax", PACKAGE).make(name)
+    options, parameters = parameters_with(defaults, LENGTH, given)
 
-
-def make(name: str, descriptor: Any = None, **parameters: Any) -> Environment:
-    """Functions of gymnax's environment `name`, with values of its parameters that are not the defaults."""
-    environment, defaults = _made(name)
-    return make_suite(_suite(name, environment, defaults.replace(**parameters)), descriptor)
-
-
-def _made(name: str) -> tuple[Any, Any]:
-    """gymnax's environment and its default parameters."""
-    gymnax = suite_package("gymnax", WAY)
-    require_known("gymnax", name, names())
-    with quietly():
-        return gymnax.make(name)
-
-
-def _suite(name: str, environment: Any, parameters: Any) -> Suite:
     def step(key: Any, state: Any, action: Any) -> tuple[Any, Any, Any, Any]:
         key, _ = jax.random.split(key)  # as gymnax's own step, whose second key is that of a reset
         observation, state, reward, terminated, _ = environment.step_env(key, state, action, parameters)
@@ -94,6 +64,7 @@ def _suite(name: str, environment: Any, parameters: Any) -> Suite:
         step,
         actions,
         int(getattr(parameters, LENGTH)),
+        options,
         _bounds(environment.observation_space(parameters)),
     )
 

@@ -9,26 +9,15 @@ time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, choice
-from workers.environments import Environment, TaskError
-from workers.environments.brax_task import quietly
-from workers.environments.suite_task import (
-    Actuators,
-    Suite,
-    describe_suite,
-    make_suite,
-    require_known,
-    suite_package,
-)
+from workers.environments.suite_task import Actuators, Package, Suite, suite_module
 
-WAY = "pip install playground==0.2.0 (about 400 MB with Warp)"
+PACKAGE = Package("mujoco_playground", "es-service with its extra, 490 MB with Warp,")
 OBSERVATIONS = ("state", "privileged_state")
 """What environments observe that have observations of several kinds, the default first."""
 
@@ -40,50 +29,13 @@ def names() -> tuple[str, ...]:
     return tuple(name for suite in of_suites for name in suite.ALL_ENVS)
 
 
-def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
-    """Description of Playground's environment `name` as a task; `given` are values of options.
-
-    Raises:
-        TaskError: Playground is not installed, has no such environment, or cannot load its models.
-    """
-    environment = _loaded(name)
-    options = {"observation": choice(*OBSERVATIONS)} if _has_kinds(environment) else {}
-    kind = str(given.get("observation", OBSERVATIONS[0]))
-    return describe_suite(_suite(name, environment, kind), options, given)
-
-
-def make(name: str, descriptor: Any = None, observation: str = OBSERVATIONS[0]) -> Environment:
-    """Functions of Playground's environment `name`."""
-    return make_suite(_suite(name, _loaded(name), observation), descriptor)
-
-
-def _registry() -> Any:
-    suite_package("mujoco_playground", WAY)
-    return suite_package("mujoco_playground._src.registry", WAY)
-
-
-def _loaded(name: str) -> Any:
-    registry = _registry()
-    require_known("playground", name, names())
-    try:
-        with quietly():
-            settings = registry.get_default_config(name)
-            settings.impl = "jax"  # the default, Warp, needs a GPU
-            return registry.load(name, config=settings)
-    except Exception as error:  # git, the network, or a folder that cannot be written
-        raise TaskError(
-            f"playground:{name} cannot be loaded ({type(error).__name__}: {error}); if it needs the models of "
-            "mujoco_menagerie, load it once where there is a network and git, and copy the folder of the package"
-        ) from error
-
-
-def _has_kinds(environment: Any) -> bool:
-    with quietly():
-        return isinstance(environment.observation_size, Mapping)
-
-
-def _suite(name: str, environment: Any, kind: str) -> Suite:
-    has_kinds = _has_kinds(environment)
+def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
+    """Playground's environment `name`."""
+    settings = _registry().get_default_config(name)
+    settings.impl = "jax"  # the default, Warp, needs a GPU
+    environment = _registry().load(name, config=settings)
+    has_kinds = isinstance(environment.observation_size, Mapping)
+    kind = given.get("observation", OBSERVATIONS[0])
 
     def observed(state: Any) -> Any:
         return state.obs[kind] if has_kinds else state.obs
@@ -103,4 +55,11 @@ def _suite(name: str, environment: Any, kind: str) -> Suite:
         step,
         Actuators(np.full(size, -1.0), np.ones(size)),
         int(environment._config.episode_length),
+        {"observation": choice(*OBSERVATIONS)} if has_kinds else {},
+        measures=lambda state: state.metrics,
     )
+
+
+def _registry() -> Any:
+    suite_module("playground", PACKAGE)
+    return suite_module("playground", PACKAGE, "mujoco_playground._src.registry")

@@ -27,6 +27,7 @@ from es_service.protocol.child import require_same_process
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.noise import KEY_WORDS, Domain, stream_keys
 from es_service.protocol.options import OptionValue, allowed_text, allowed_value, option_values
+from es_service.protocol.sources import SUITES
 from workers.environments import (
     SHIPPED,
     TaskError,
@@ -64,7 +65,7 @@ def task_named(name: str, options: Mapping[str, OptionValue]) -> TaskSpec:
         TaskError: there is no such task, it has no such option, or it is of a kind that is no such environment.
     """
     if not isinstance(name, str) or (":" not in name and name not in SHIPPED):
-        others = "brax:NAME, mujoco:ID, gymnax:NAME, playground:NAME or module:Class"
+        others = f"brax:NAME, mujoco:ID, {', '.join(f'{suite}:NAME' for suite in SUITES)} or module:Class"
         raise TaskError(f"task = {name!r} is not shipped; choose among {', '.join(SHIPPED)}, {others}")
     if is_host_task(name):
         raise TaskError(f"task = {name!r} is a Python object, no task in JAX; step it by itself")
