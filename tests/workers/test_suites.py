@@ -397,8 +397,7 @@ def compare(found: Any, wanted: Any, tolerance: float = 2e-4) -> None:
 def test_es_learns_the_cartpole_of_each_suite_that_has_one(
     name: str, module: str, steps: int, least: float, tmp_path: Path
 ) -> None:
-    """The lower end of the interval of new episodes. Gymnasium calls a mean of 475 solved; a step of Playground's gives at
-    most 1."""
+    """By the lower end of the interval of new episodes. Gymnasium calls a mean of 475 solved."""
     pytest.importorskip(module)
     search = {"algorithm": "es", "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.2, "l2": 0}}
     config = {
