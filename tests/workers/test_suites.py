@@ -154,7 +154,7 @@ def test_descriptors_of_measures_and_of_a_function_of_the_users(
     assert names["mixed"] == ("place_now", "observation_7", "steps", "behind")
     assert (names["users"], known["users"][1].descriptor_bounds) == (("squared",), ((0.0, 16.0),))
     assert known["mixed"][1].descriptor_bounds[2:] == own["both"][1]
-    found = {}
+    found, place = {}, 0
     for name, (value, _) in known.items():
         environment = make_suite(grid(described=own), value)
         state = environment.step(environment.reset(keys()[1]), jnp.zeros(3))[0]

@@ -222,7 +222,7 @@ def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
         options={"descriptor": Option(None), **suite.options},
         action_bounds=suite.actions.bounds,
         discrete_actions=isinstance(suite.actions, Choices) and suite.actions.single and suite.mask is None,
-        **(facts | suite.facts),
+        **{**facts, **suite.facts},
     )
 
 
