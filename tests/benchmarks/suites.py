@@ -85,8 +85,8 @@ def measured(name: str, batch: int) -> dict[str, Any]:
     return row | {f"{side}_steps_per_s": statistics.median(found) for side, found in rates.items()}
 
 
-COLUMNS: tuple[str, ...] = ("task", "observation", "action", "xla_steps_per_s", "simd_steps_per_s", "xla_compile_s", "simd_compile_s",
-           "simd_refuses")  # fmt: skip
+RATES = ("xla_steps_per_s", "simd_steps_per_s", "xla_compile_s", "simd_compile_s")
+COLUMNS: tuple[str, ...] = ("task", "observation", "action", *RATES, "simd_refuses")
 
 
 def main() -> None:
