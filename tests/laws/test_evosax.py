@@ -157,6 +157,16 @@ def test_a_generation_without_a_valid_member_teaches_nothing():
 
 
 @pytest.mark.slow
+def test_an_invalid_member_is_not_the_best_one_if_all_others_are_equal():
+    """As where no reward is found yet: the first of equal members would be the best one, and so the centre."""
+    config = api.load_config(config_of("DifferentialEvolution"))
+    search, populations, states = driven(config, np.zeros(3, np.float32), 1)
+    after = search.tell(states[0], evaluations(1, [0.0] * 12, {0, 3}))
+    assert after.centres[0].centre_D.tobytes() == populations[0][1].tobytes()
+    assert after.extra[evosax.STATE]["best_fitness"] == 0.0
+
+
+@pytest.mark.slow
 def test_a_state_of_another_form_is_refused_with_what_differs():
     config = api.load_config(config_of())
     search, _, states = driven(config, np.zeros(3, np.float32), 1)

@@ -32,6 +32,7 @@ from threading import Lock
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, create_model, model_validator
 
 from es_service.config.model import RunConfig
@@ -184,13 +185,24 @@ def _algorithm(name: str, version: str, config: RunConfig) -> Algorithm:
         told = in_columns(evaluations)
         if told.generation == 0 or not told.valid_N.any():
             return state
-        fitness_N = invalid_lowest(np.where(told.valid_N, told.fitness_N, np.nan))
+        is_known_N = told.valid_N & np.isfinite(told.fitness_N)
+        fitness_N = invalid_lowest(np.where(is_known_N, told.fitness_N, np.nan))
+        if "population" in arrays:
+            fitness_N = _none_unknown_best(fitness_N, is_known_N)
         now, centre_D = computed("tell", state, told.generation, fitness_N)
         numbers = np.array([int(number) for number in re.findall(r"\d+", version)], np.int64)
         centre = replace(state.centres[0], centre_D=centre_D)
         return replace(state, centres=(centre,), extra=read_only({**state.extra, STATE: now, VERSION: numbers}))
 
     return Algorithm(ask, tell, metrics={"sigma": _mean_sigma} if "std" in arrays else {})
+
+
+def _none_unknown_best(fitness_N: NDArray[np.float64], is_known_N: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The same fitness; but if it is equal everywhere, as where no reward is found yet, that of unknown members is a
+    millionth lower. Of equal members evosax takes the first for the best one, which is the centre."""
+    if np.ptp(fitness_N.astype(np.float32)) or is_known_N.all() or not is_known_N.any():
+        return fitness_N
+    return np.where(is_known_N, fitness_N, fitness_N - 1e-6 * np.maximum(np.abs(fitness_N), 1.0))
 
 
 def _mean_sigma(state: SearchState) -> float:
