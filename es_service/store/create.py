@@ -89,7 +89,9 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         evaluations = iter(beginning.evaluations)
         for generation, given in enumerate(beginning.history):
             recorded = metric_values(beginning.metrics.get(generation, {}))  # what a program has recorded is no column
-            values = {column.name: given.get(column.name) for column in meta.columns if column.name not in recorded}
+            values = {
+                column.name: None if column.name in recorded else given.get(column.name) for column in meta.columns
+            }
             evaluated = [row_bytes(stored_values(meta.evaluation_columns, row)) for row in next(evaluations, ())]
             # The state of the newest generation is stored, but not those of the generations before it.
             state = state_sha256(state_sum(in_force if generation == beginning.newest else {}))
@@ -99,7 +101,8 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         columns = {column.name for column in meta.columns}
         for generation, named in beginning.metrics.items():
             new = {name: value for name, value in named.items() if columns.isdisjoint(metric_values({name: value}))}
-            record_metrics(connection, generation, new)
+            if new:
+                record_metrics(connection, generation, new)
         if beginning.start is not None:
             put_meta(connection, START, base64.b64encode(encode_part(beginning.start)).decode())
 

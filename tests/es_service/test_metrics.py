@@ -207,6 +207,18 @@ def test_a_program_records_numbers_of_each_generation(tmp_path):
     assert fork.history.metric_loss.fillna(-1.0).tolist() == [0.0, -1.0, 1.0, -1.0, -1.0]
 
 
+@pytest.mark.slow
+def test_a_fork_may_have_a_column_with_the_name_of_a_recorded_metric(tmp_path):
+    """The column has no value before the fork; what was recorded under another name stays."""
+    config = api.load_config(changed(environment="python:metric_tasks:Python"), ["budget.generations=1"])
+    record = lambda row: {"number": 1.0, "loss": 2.0} if row["generation"] else {"number": 3.0}  # noqa: E731
+    run = api.run(config, tmp_path / "run", on_generation=record).run
+    assert run.history.metric_number.tolist() == [3.0, 1.0]
+    fork = api.fork(run.folder, ["task.metrics=[number:sum]", "budget.generations=2"], out=tmp_path / "fork").run
+    assert fork.history.metric_number.fillna(-1.0).tolist() == [-1.0, -1.0, 11.0]
+    assert fork.history.metric_loss.fillna(-1.0).tolist() == [-1.0, 2.0, -1.0]
+
+
 def test_what_a_program_records_is_a_curve_and_a_measure_of_groups(tmp_path):
     folders = []
     for group, sigma in enumerate((0.1, 0.2)):
