@@ -358,8 +358,10 @@ def _latex(measures: Sequence[Compared]) -> str:
 
 
 def _in_latex(value: float) -> str:
-    """A number in text, whose sign is a minus and no hyphen."""
-    return re.sub(r"-[\d,.]+", r"$\g<0>$", _known(value))
+    """A number in text, whose sign is a minus and no hyphen, and whose power of ten is one."""
+    if power := re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text := _known(value)):
+        return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
+    return re.sub(r"-[\d,.]+", r"$\g<0>$", text)
 
 
 _ESCAPES = {sign: f"\\{sign}" for sign in "_%&#${}"} | {

@@ -336,3 +336,9 @@ def test_names_of_groups_are_text_in_tables_of_latex():
     average = between.Average("a_1 \\ {50 %} ~^", 2, 1.0, None, None, None)
     text = between.text_of([between.Compared("best", "best", False, (average,), ())], ".tex")
     assert r"a\_1 \textbackslash{} \{50 \%\} \textasciitilde{}\textasciicircum{} & 2" in text
+
+
+def test_small_numbers_have_a_power_of_ten_in_tables_of_latex():
+    average = between.Average("a", 2, -1.3e-5, (-2.0e-5, 0.5), None, None)
+    text = between.text_of([between.Compared("best", "best", False, (average,), ())], ".tex")
+    assert r"a & 2 & $-1.30 \times 10^{-5}$ [$-2.00 \times 10^{-5}$, 0.500]" in text
