@@ -453,6 +453,10 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "slices": slices,
     "dynamic": index_cases.dynamic,
     "pads": pads,
+    "empty arrays": lambda draw: (
+        lambda x, i: (jnp.empty((2, 3)), jnp.empty(x.shape, bool), jnp.empty_like(i).at[1:].set(i[1:])),
+        [floats(draw, (3,)), integers(draw, (3,))],
+    ),
     "moves": moves,
     "choices": choices,
     "integer choice": lambda draw: (

@@ -64,6 +64,15 @@ def _iota(t: Tracer, equation: Any) -> Nodes:
     return t.constants(np.broadcast_to(np.expand_dims(along, [k for k in range(len(shape)) if k != axis]), shape))
 
 
+@primitive("empty")
+def _empty(t: Tracer, equation: Any) -> Nodes:
+    """Zeros, as on a processor, of what `jnp.empty` leaves open from JAX 0.12 on."""
+    shape, dtype = equation.params["shape"], equation.params["dtype"]
+    if graph_dtype(dtype) == "k":
+        return t.keys(t.constants(np.zeros((*shape, 2), np.uint32)))
+    return t.constants(np.zeros(shape, dtype))
+
+
 @primitive("pad")
 def _pad(t: Tracer, equation: Any, x: Nodes, value: Nodes) -> Nodes:
     for axis, (low, high, inner) in enumerate(equation.params["padding_config"]):
