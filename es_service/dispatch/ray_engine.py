@@ -235,9 +235,14 @@ class Actors:
         return ""
 
     def last_words(self, worker: int) -> str:
-        """The last lines that a lost actor has printed, if its node still answers within WORDS_S."""
-        place, nodes = self._gone.pop(worker, None), None if self._watch is None else self._watch.latest().alive
-        if place is None or not place.logs or (nodes and place.node not in nodes):
+        """The last lines that a lost actor has printed; in a cluster that was joined, if its node still answers within
+        WORDS_S. The files of a Ray of our own are on this machine."""
+        place = self._gone.pop(worker, None)
+        if place is None or not place.logs:
+            return ""
+        if self._watch is None:
+            return ends_of_files(place.logs, WORDS_BYTES)
+        if (nodes := self._watch.latest().alive) and place.node not in nodes:
             return ""
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(place.node, soft=False)
         read = self._read.options(scheduling_strategy=affinity)

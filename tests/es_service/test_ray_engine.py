@@ -100,6 +100,8 @@ class PretendedRay:
         """(actor, kind of chunks) of each call of `compile`."""
         self.refusing: set[str] = set()
         """Nodes whose code is not the driver's."""
+        self.logs: tuple[str, ...] = ()
+        """Files of what actors print."""
         self.stored: list[bytes] = []
         self.strategies: list[Any] = []
         """Where each actor was to be placed: "SPREAD", or (node, options)."""
@@ -173,7 +175,7 @@ class PretendedRay:
             return 0.0
 
         methods = {
-            "place": lambda: ("host", actor.number, self.node_of(actor.number)),
+            "place": lambda: ("host", actor.number, self.node_of(actor.number), self.logs),
             "build": lambda *given: f"kind {actor.number % 2}",
             "compile": compile,
             "run": lambda *item: pickle.dumps(
@@ -253,6 +255,20 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
         ray.on_run = node_dies
         assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
+
+
+def test_what_a_lost_actor_of_a_ray_of_our_own_has_printed_is_read_without_a_task_of_ray(tmp_path):
+    """A task would need a process, which a busy machine may not start in time."""
+    (tmp_path / "out").write_text("the licence has expired\n")
+    ray = PretendedRay()
+    ray.logs = (str(tmp_path / "out"),)
+    ours = transport(ray, Limits(1))
+    ours.start(0)
+    while not ours.places():
+        ours.receive(0.0)
+    ours.kill(0)
+    assert ours.last_words(0) == "the licence has expired"
+    assert ours.last_words(0) == "", "it is told once"
 
 
 def test_seconds_of_processors_are_those_of_the_driver_and_of_all_actors_lost_ones_too():
