@@ -27,7 +27,7 @@ from tests.references import es as reference
     ],
 )
 def test_each_population_has_streams_of_its_own(what, sigma, changes):
-    evaluator = DirectEvaluator(spec(episode_steps=20, **changes))
+    evaluator = DirectEvaluator(spec(episode_steps=20, rollout="simd", **changes))
     point = centre(random_parameters(), sigma=sigma)
     chunks = [TrainingChunk(3, 0), *(TrainingChunk(3, 0, ask) for ask in range(3)), TrainingChunk(3, 0, 1)]
     found = [r.fitness.tobytes() + r.descriptor.tobytes() for r in evaluator.evaluate([(point, c) for c in chunks])]

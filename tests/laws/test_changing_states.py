@@ -256,7 +256,7 @@ seeds = st.integers(0, 2**32)
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(courses, seeds, st.sampled_from([None, 2, 3]), st.sets(st.integers(0, GENERATIONS - 1)), st.data())
 def test_every_kept_generation_is_the_reference_whatever_happened(tmp_path_factory, course, seed, keep, reopened, data):
     """Some commits are killed and repeated by another process, which continues from what is stored."""
@@ -328,7 +328,7 @@ def same(now, then):
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(courses, seeds, st.integers(0, 10**6))
 def test_damage_of_the_newest_generation_falls_back_to_the_one_before(tmp_path_factory, course, seed, chosen):
     states, folder = every_state(seed, course), tmp_path_factory.mktemp("damage") / "run"
