@@ -85,14 +85,16 @@ WIDTHS = [
     ("point_maze", True, 8, ()),
     ("point_maze", True, 8, (80, 112)),
 ]
+XLA_S = (64, 64), (48, 33)
+"""Hidden layers with which episodes are held against those of xla; `test_check.py` holds all shapes against the
+reference implementation."""
 
 
 @pytest.mark.parametrize(
     ("task", "training", "pairs", "hidden", "rank"),
     [
         *((*kind, rank) for kind in WIDTHS for rank in (0, 2)),
-        pytest.param("ant_trap", True, 5, (256, 256), 0, marks=pytest.mark.slow),
-        pytest.param("ant_trap", True, 5, (256, 256), 2, marks=pytest.mark.long),
+        *(pytest.param("ant_trap", True, 5, (256, 256), rank, marks=pytest.mark.long) for rank in (0, 2)),
     ],
 )
 def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int, hidden: tuple[int, ...], rank: int):
@@ -110,7 +112,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
         found.append(kernel.run(weights, float(unit), mean_O, std_O, keys if training else None, *lanes))
     assert len(found[0].returns) == 2 * pairs
     assert len(np.unique(found[0].returns)) > pairs
-    if training and pairs == worker_spec.chunk_pairs:
+    if hidden in XLA_S and training and pairs == worker_spec.chunk_pairs:
         theirs = workers.xla.make_training_rollout(environment, worker_spec)
         theirs = theirs(centre_D, unit, mean_O, std_O, keys, resets, actions)
         np.testing.assert_allclose(found[0].returns, np.asarray(theirs.returns).ravel(), rtol=1e-3)
