@@ -281,7 +281,7 @@ def check_random_loop(data: st.DataObject) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_random_loops_are_jaxs(data: st.DataObject) -> None:
     check_random_loop(data)
@@ -440,7 +440,7 @@ def check_random_while(data: st.DataObject) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_random_loops_that_data_ends_are_jaxs(data: st.DataObject) -> None:
     check_random_while(data)

@@ -37,7 +37,7 @@ SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_s
 
 @pytest.mark.slow  # all of them together
 @pytest.mark.parametrize("name", CASES)
-@settings(max_examples=5, deadline=None, suppress_health_check=SLOW)
+@settings(max_examples=3, deadline=None, suppress_health_check=SLOW)
 @given(data=st.data())
 def test_a_primitive_is_jaxs(name: str, data: st.DataObject) -> None:
     check(*CASES[name](data.draw))
