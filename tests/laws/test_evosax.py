@@ -38,6 +38,8 @@ CASES = {
     "DifferentialEvolution": {"crossover_rate": 0.5},
 }
 """Name in evosax -> options."""
+OF_ADAM = {"population_size": 64, "options": {"optimizer": "adam", "learning_rate": 0.05}}
+OF_SGD = {"population_size": 24, "options": {"optimizer": "sgd", "learning_rate": 1.0}}
 
 
 def config_of(name="CMA_ES", task=HILL, generations=5, seed=0, workers=1, **search):
@@ -194,8 +196,8 @@ def test_a_state_of_another_form_is_refused_with_what_differs():
     ("name", "search"),
     [
         ("CMA_ES", {}),
-        ("Open_ES", {"population_size": 64, "options": {"optimizer": "adam", "learning_rate": 0.05}}),
-        ("SNES", {"population_size": 24, "options": {"optimizer": "sgd", "learning_rate": 1.0}}),
+        pytest.param("Open_ES", OF_ADAM, marks=pytest.mark.long),
+        pytest.param("SNES", OF_SGD, marks=pytest.mark.long),
         ("PSO", {"population_size": 32, "sigma": 0.5}),
     ],
 )
