@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from es_service.api import Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
+    from es_service.api import Observer, Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
     from es_service.asking import ask_tell
     from es_service.dispatch.staying import workers
     from es_service.report import plots
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "Observer",
     "Stop",
     "__version__",
     "ask_tell",

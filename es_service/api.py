@@ -13,6 +13,7 @@ from typing import Any
 from es_service.config.given import Overrides, Source, parse_overrides
 from es_service.config.model import RunConfig
 from es_service.errors import WayOut
+from es_service.loop.state import Observer as Observer
 from es_service.loop.state import Stop as Stop
 from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.machine import given_path
@@ -62,9 +63,9 @@ def _listener(
             yield on_generation
         elif progress and in_notebook():
             with show_in_notebook(str(folder)) as show:
-                yield show
+                yield Observer(show)
         else:
-            yield lambda row: None
+            yield Observer(lambda row: None)
 
     return Listener(shown, on_notice, on_compile, on_output, hook)
 
@@ -90,7 +91,8 @@ def run(
             holds the database, after it has begun to wait for that. If it returns `Stop("reason")`, the run ends there
             with this reason, and can be resumed. A mapping from names to numbers that it returns, or
             `Stop("reason", {...})`, records these as `metric_NAME` of the generation: columns of the history, curves,
-            metrics of trackers, and measures of comparisons. Other values have no effect.
+            metrics of trackers, and measures of comparisons. Other values have no effect. Each generation is then
+            committed by itself; not with `Observer(function)`, which only looks (`store.commit_interval_s`).
         on_notice: called with each notice for the user; by default, each is printed as a line on stderr.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.

@@ -240,7 +240,7 @@ class AskTell:
         try:
             while True:
                 work = self._context.run(self._session.send, results)
-                assert work is not None
+                assert isinstance(work, Sequence)
                 self._context.run(next, self._session)
                 if not isinstance(work[0][1], GradientChunk):
                     break

@@ -20,8 +20,9 @@ from es_service.errors import Interrupted
 from es_service.loop.blocks import MAP, joined, value_of
 from es_service.loop.contents import stored_elite
 from es_service.loop.history import NO_INTEGER
+from es_service.loop.state import Generation
 from es_service.protocol.content import Policy
-from es_service.protocol.episodes import DispatchCounts
+from es_service.protocol.episodes import DispatchCounts, Wait
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from workers.rollouts import recorder
@@ -74,8 +75,8 @@ def policy_with(parameters_D: np.ndarray) -> Policy:
 class AtTheEnd:
     """Begins to compute work when somebody waits for it."""
 
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
-        return lambda: self.evaluate(work)
+    def begin(self, work: Sequence[Work]) -> Wait:
+        return lambda most_s: self.evaluate(work)
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         raise NotImplementedError
@@ -195,11 +196,12 @@ class MemoryStore:
     def newest_history(self, count: int) -> list[dict]:
         return self.rows[-count:]
 
-    def commit(self, generation, parts, history, evaluations, contents) -> None:
-        self.generation = generation
-        self.contents |= contents
-        self.parts = {name: part for name, part in (self.parts | parts).items() if part is not None}
-        self.rows.append(dict(history))
+    def commit(self, generations: Sequence[Generation]) -> None:
+        for one in generations:
+            self.generation = one.number
+            self.contents.update(one.contents)
+            self.parts = {name: part for name, part in {**self.parts, **one.parts}.items() if part is not None}
+            self.rows.append(dict(one.history))
 
 
 def stop(pid: int) -> None:

@@ -39,6 +39,7 @@ from es_service.cli.status import print_certified, print_summary
 from es_service.cli.sweep import ParallelOption, SeedsOption, polish_goals
 from es_service.errors import ConfigError, Interrupted, RunLockedError, ServiceError, WayOut
 from es_service.loop.history import Row
+from es_service.loop.state import Observer
 from es_service.protocol.user_code import users_error
 from es_service.report.progress import ShowNotice, ShowRow, print_notice, show_progress
 from es_service.runs.checked_config import changed_config
@@ -96,7 +97,7 @@ def session(
             tracked(folder, log or (), partial(tell, note)) as send,
         ):
             outcome = work(
-                on_generation=partial(tell_generation, show),
+                on_generation=Observer(partial(tell_generation, show)),
                 on_notice=partial(tell, note),
                 on_compile=partial(tell, note),
                 on_output=output_shown(show_output),

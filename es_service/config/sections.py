@@ -14,6 +14,7 @@ from es_service.config.parts import (
     CellCounts,
     Count,
     Descriptor,
+    Fraction,
     Metrics,
     NotNegative,
     Number,
@@ -234,7 +235,15 @@ class BudgetConfig(Section):
 
 
 class StoreConfig(Section):
-    """What the run folder keeps besides the newest state. May change on resume."""
+    """How generations are stored, and what the run folder keeps besides the newest state. May change on resume."""
+
+    commit_interval_s: Fraction = Field(
+        0.05,
+        description="Generations that end within so many seconds are stored in one transaction, at most 1. `kill -9` "
+        "loses at most these and the unfinished one, and the run computes them again with the same results. `0`: each "
+        "is stored by itself. So it is in any case where results cannot be had again (`ask_tell`, rollout `host`), and "
+        "where a program may stop the run after each generation (`on_generation`).",
+    )
 
     keep_every: Count | None = Field(
         None,

@@ -32,7 +32,7 @@ from es_service.dispatch.waits import Computing, Waits
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.child import require_same_process
-from es_service.protocol.episodes import DispatchCounts, pieces_of, together
+from es_service.protocol.episodes import DispatchCounts, Wait, pieces_of, together
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 from es_service.protocol.policies import POLICY_SLOTS
 
@@ -242,9 +242,11 @@ class Engine(Generic[AnyTransport]):
             EvaluationError: a work item failed in all its attempts, or no worker starts or gets a place.
             Interrupted: a stop was requested. ForkedError: this process was forked from that of the engine.
         """
-        return self.begin(work)()
+        results = self.begin(work)(math.inf)
+        assert results is not None
+        return results
 
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+    def begin(self, work: Sequence[Work]) -> Wait:
         """As `evaluate`, but returns when chunks have been sent; the function that it returns waits for the results.
 
         Results for which nobody waits are dropped when another evaluation begins, and this waits for them first.
@@ -268,9 +270,12 @@ class Engine(Generic[AnyTransport]):
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         self._tell_waits()
 
-        def wait() -> list[ChunkResult]:
+        def wait(most_s: float) -> list[ChunkResult] | None:
+            until = time.monotonic() + most_s
             while pending(self._state):
-                self._serve()
+                if (left_s := until - time.monotonic()) <= 0.0:
+                    return None
+                self._serve(left_s)
             return [result for item_id, _ in parts for result in self._results.pop(item_id)]
 
         return wait
@@ -307,12 +312,12 @@ class Engine(Generic[AnyTransport]):
                 first += size
         return parts
 
-    def _serve(self) -> None:
-        """Handle the next message, or check the deadlines if none arrives for a short time."""
+    def _serve(self, most_s: float = POLL_S) -> None:
+        """Handle the next message, or check the deadlines if none arrives for a short time of at most `most_s`."""
         require_same_process(self._maker, *_OF_ITS_PROCESS)
         if (number := self._should_stop()) is not None:
             raise Interrupted(number)
-        wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))
+        wait_s = min(POLL_S, most_s, max(0.0, next_deadline(self._state) - time.monotonic()))
         if (message := self.transport.receive(wait_s)) is not None:
             self._handle(message)
         else:  # check deadlines only if no message waits, or a late check would kill workers that have answered

@@ -130,6 +130,18 @@ class Clock:
         self._laps[name] = self._laps.get(name, 0.0) + now - self._last
         self._last = now
 
+    @staticmethod
+    def now() -> float:
+        """Seconds, for `meanwhile`."""
+        return time.perf_counter()
+
+    def meanwhile(self, name: str, since: float) -> float:
+        """Add the seconds since then to the total of `name`, instead of to the lap in which they passed; now."""
+        now = self.now()
+        self._laps[name] = self._laps.get(name, 0.0) + now - since
+        self._last += now - since
+        return now
+
     def finish_generation(self) -> tuple[float, dict[str, float]]:
         """End a generation: (seconds since the end of the last one, seconds of its laps by history column)."""
         now = time.perf_counter()

@@ -1,14 +1,17 @@
 """The main loop of a run. A generation is: propose, roll out, step, evaluate, tell, finish.
 
 The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. A
-generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed. It is a
-generator: `results = yield work`. Whoever drives it computes the work, or has it computed.
+generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed, with
+those that have ended shortly before. It is a generator: `results = yield work`. Whoever drives it computes the work, or
+has it computed.
 Generation 0 proposes the initial centres, without populations around them, so that it has no gradient and takes no
 step.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -19,6 +22,7 @@ import numpy as np
 from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
 from es_service.config.workload import policy_spec
+from es_service.logs import in_generation
 from es_service.loop import budget as budgets
 from es_service.loop.blocks import state_of
 from es_service.loop.budget import Clock
@@ -44,7 +48,8 @@ from es_service.loop.generation import (
     tell,
 )
 from es_service.loop.history import HistoryRow
-from es_service.loop.state import RunState, Search, Stop, Store, Stored
+from es_service.loop.state import Generation, RunState, Search, Stop, Store, Stored
+from es_service.protocol.content import Arrays
 from es_service.protocol.episodes import DispatchCounts, Evaluator, OverlappedRequests, Requests, Value
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
@@ -58,9 +63,11 @@ def run(
     report: Callable[[HistoryRow], object],
     failed: Callable[[Sequence[str]], object] = lambda failures: None,
     counts: Callable[[], DispatchCounts] = DispatchCounts,
+    commit_interval_s: float = 0.0,
+    is_last: Callable[[RunState], bool] = lambda state: False,
 ) -> OverlappedRequests[tuple[RunState, str]]:
     """Run generations until the budget is spent or `report` returns a `Stop`. While the rollouts of one are computed,
-    the one before is stored.
+    those before it are stored.
 
     Args:
         state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
@@ -69,6 +76,11 @@ def run(
         failed: called before that with texts that name the generation's failed episodes, if there are any of which
             the rollouts know more.
         counts: returns the numbers of workers and of faults so far.
+        commit_interval_s: seconds after the end of a generation in which it is stored, in one transaction with those
+            that end meanwhile. A `Stop` ends the session with the last generation of a transaction, and only with 0
+            with that of its row in any case.
+        is_last: whether a generation, whose state this is, must be the last of its transaction, since `report` may
+            return a `Stop` for it.
 
     Returns:
         The last state and the reason for ending, in words.
@@ -79,8 +91,12 @@ def run(
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
     state = begun = state or initial_state(search)
     reachable = reachable_in(search, state)
-    policies = StatePolicies(store.content)
-    finished: list[Finished] = []
+    waiting: list[Finished] = []
+    """Generations that are not stored, in their order."""
+    due_s = math.inf  # when they are to be stored
+
+    def content(name: bytes) -> Arrays:
+        return next((one.contents[name] for one in waiting if name in one.contents), None) or store.content(name)
 
     def so_far() -> DispatchCounts:
         """The numbers of this session, to which the times of earlier sessions are added."""
@@ -88,23 +104,27 @@ def run(
         return replace(now, rollout_s=begun.rollout_s + now.rollout_s, cpu_s=begun.cpu_s + now.cpu_s)
 
     def record() -> str | None:
-        """Store and report the generation that is finished, if there is one that is not stored. Returns the reason to
-        stop, if there is one."""
-        if not finished:
+        """Store and report the generations that wait. Returns the reason to stop, if there is one."""
+        if not waiting:
             return None
-        clock.lap("seconds_rollout")  # of the next generation, whose work has been sent
-        newest = finished.pop()
-        if newest.failures:
-            failed(newest.failures)
-        row, table = rows(search, newest, reachable)
-        clock.lap("seconds_driver")
-        store.commit(newest.state.generation, newest.parts, row, table, newest.contents)
-        clock.lap("seconds_store")
-        answer = report(row)
-        clock.lap("seconds_driver")
-        return answer.reason if isinstance(answer, Stop) else None
+        since, together = clock.now(), [*waiting]
+        waiting.clear()
+        for one in together:
+            if one.failures:
+                failed(one.failures)
+        taken = [
+            Generation(one.state.generation, one.parts, *rows(search, one, reachable), one.contents) for one in together
+        ]
+        since = clock.meanwhile("seconds_driver", since)
+        store.commit(taken)
+        since = clock.meanwhile("seconds_store", since)
+        answers = [report(one.history) for one in taken]
+        clock.meanwhile("seconds_driver", since)
+        return next((answer.reason for answer in answers if isinstance(answer, Stop)), None)
 
+    policies = StatePolicies(content)
     while (reason := spent(search.config.budget, state)) is None:
+        in_generation(state.generation + 1)
         requests = generation(search, policies, clock, state, so_far)
         results: Any = None
         try:
@@ -112,16 +132,23 @@ def run(
                 try:
                     work = requests.send(results)
                 except StopIteration as end:
-                    finished.append(end.value)
+                    newest: Finished = end.value
                     break
                 yield work
-                if (reason := record()) is not None:
-                    return state, reason
-                results = yield None
+                results = None
+                while results is None:
+                    if waiting and time.perf_counter() >= due_s and (reason := record()) is not None:
+                        return state, reason
+                    results = yield due_s - time.perf_counter() if waiting else math.inf
         except BaseException:
-            record()  # if this generation has failed before it was sent
+            record()  # this generation is lost, and not those before it
             raise
-        state = finished[0].state
+        state = newest.state
+        if is_last(state):
+            due_s = time.perf_counter()
+        elif not waiting:
+            due_s = time.perf_counter() + commit_interval_s
+        waiting.append(newest)
     return state, record() or reason
 
 
@@ -136,12 +163,14 @@ def drive(session: OverlappedRequests[Value], evaluator: Evaluator) -> Value:
         while True:
             try:
                 work = session.send(results)
-                assert work is not None
-                wait = evaluator.begin(work)
-                next(session)
+                assert isinstance(work, Sequence)
+                wait, results = evaluator.begin(work), None
+                while results is None:
+                    most_s = next(session)
+                    assert isinstance(most_s, float)
+                    results = wait(most_s)
             except StopIteration as end:
                 return end.value
-            results = wait()
 
 
 def stored_state(store: Stored) -> RunState | None:

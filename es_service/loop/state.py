@@ -7,7 +7,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +129,22 @@ class Stored(Protocol):
     def newest_history(self, count: int) -> Sequence[Mapping[str, Any]]: ...
 
 
+class Generation(NamedTuple):
+    """What is stored of a generation."""
+
+    number: int
+    parts: Changes
+    """Parts of the state that it has changed, None for those that it has removed; the others keep their values."""
+    history: HistoryRow
+    """Value of each column of the run; `generation` may be left out; NaN or None stands for no value."""
+    evaluations: Table = MappingProxyType({})
+    """Likewise for the centres that it has evaluated, in the order of the asks."""
+    contents: Contents = MappingProxyType({})
+    """Policies and traces by name, among them those that the parts name and that no generation before named."""
+    recorded: Mapping[str, float] = MappingProxyType({})
+    """Metrics that a caller has told, by name; they are no columns."""
+
+
 class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
@@ -135,10 +152,8 @@ class Store(Protocol):
         """A policy or a trace that a stored state names. Raises KeyError if there is none of this name."""
         ...
 
-    def commit(
-        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table, contents: Contents
-    ) -> None:
-        """Take a generation, with the policies and traces that it names and no generation before."""
+    def commit(self, generations: Sequence[Generation]) -> None:
+        """Take generations that follow one another, all or none."""
         ...
 
 
@@ -159,6 +174,24 @@ class Stop:
                 field="reason",
                 value=self.reason,
                 allowed="words",
+            )
+
+
+@dataclass(frozen=True)
+class Observer:
+    """A function that only looks at history rows, so that generations may be committed together before it is called
+    with the row of each. It cannot end a session and records nothing."""
+
+    function: Callable[[Mapping[str, Any]], object]
+
+    def __call__(self, row: Mapping[str, Any]) -> None:
+        """Show a row. Raises ConfigError if the function returns a `Stop`."""
+        if isinstance(self.function(row), Stop):
+            raise ConfigError(
+                "on_generation: the function of an Observer has returned a Stop; give the function itself, so that the "
+                "run can end with the generation that it was called with",
+                field="on_generation",
+                allowed="a function",
             )
 
 

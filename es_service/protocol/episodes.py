@@ -174,9 +174,12 @@ Requests = Generator[Sequence[Work], list[ChunkResult], Value]
 Whoever drives it decides where the chunks are computed: an engine, the caller of `ask_tell`, or a test with a list.
 """
 
-OverlappedRequests = Generator[Sequence[Work] | None, list[ChunkResult] | None, Value]
-"""As `Requests`, but in two steps, so that the driver need not wait: it yields chunks to be sent, stores the generation
-before once it is resumed, yields None, and receives the results."""
+OverlappedRequests = Generator[Sequence[Work] | float, list[ChunkResult] | None, Value]
+"""As `Requests`, but in two steps, so that the driver need not wait: it yields chunks to be sent, may store finished
+generations once it is resumed, and yields the seconds for which it can wait. It receives the results, or None if they
+were not there in time; then it stores these generations, and yields seconds again."""
+Wait = Callable[[float], list[ChunkResult] | None]
+"""Waits for results at most so many seconds; None if they are not there in time."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +207,7 @@ class Evaluator(Protocol):
         """Numbers of workers and of faults so far."""
         ...
 
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+    def begin(self, work: Sequence[Work]) -> Wait:
         """Have chunks run, and return the function that waits for their results, which `evaluate` returns."""
         ...
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, WayOut
-from es_service.loop.history import HistoryRow, Table
-from es_service.loop.state import Changes
-from es_service.protocol.content import Contents
+from es_service.loop.state import Generation
 from es_service.protocol.machine import CODE, computed_on, is_mixed, platform_info, without_code
 from es_service.protocol.sources import Sources, driver_sources, in_words, other_files, worker_sources
 from es_service.store.writer import RunStore
@@ -123,25 +121,17 @@ class Recorder:
         """Platforms of the workers that there are now."""
         return frozenset() if self._engine is None else self._engine.platforms
 
-    def commit(
-        self,
-        workers: frozenset[str],
-        generation: int,
-        parts: Changes,
-        history: HistoryRow,
-        evaluations: Table,
-        contents: Contents,
-        recorded: Mapping[str, float],
-    ) -> None:
+    def commit(self, workers: frozenset[str], generations: Sequence[Generation]) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 
         Args:
-            workers: `workers` when the generation was finished.
+            workers: `workers` when the generations were finished.
 
         Raises:
             ConfigError: the run would become mixed, but `strict` is set. Otherwise as `RunStore.commit`.
         """
         if workers != self._workers:
+            generation = generations[0].number
             platform = {**computed_on(self._driver, workers), CODE: self._code}
             before = self._store.platform_before(generation)
             if before is None:
@@ -157,4 +147,4 @@ class Recorder:
                     f"from generation {generation} on, this run is computed on another platform, or on several: "
                     f"{in_words(changes)}. {MIXED}"
                 )
-        self._store.commit(generation, parts, history, evaluations, contents, recorded)
+        self._store.commit(generations)

@@ -329,13 +329,12 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
             while True:
                 began = time.perf_counter()
                 work = session.send(results)
+                assert isinstance(work, Sequence)
                 sent = time.perf_counter()
                 driver_s += sent - began
                 next(session)
                 beside_s += time.perf_counter() - sent
-                results = [
-                    _for_chunk(next(replayed[_kind(subject_chunk)]), subject_chunk) for subject_chunk in work or ()
-                ]
+                results = [_for_chunk(next(replayed[_kind(subject_chunk)]), subject_chunk) for subject_chunk in work]
     driver_s, beside_s = map(float, np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0))
     return driver_s, beside_s
 

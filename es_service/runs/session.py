@@ -28,7 +28,7 @@ from es_service.errors import (
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.history import METRIC, evaluated_word
-from es_service.loop.state import Stop, no_observations
+from es_service.loop.state import Observer, Stop, no_observations
 from es_service.protocol.episodes import METRIC_FORM, DispatchCounts, OverlappedRequests, wrong_metric_names
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
@@ -49,6 +49,8 @@ from workers.policies.policy import initial_parameters
 _LOG = logger(__name__)
 LONG_PLACING_S = 2.0
 """Time from which on it is said that centroids are placed."""
+TO_CERTIFY = "the best centre may have reached budget.target_certified"
+"""Reason why a session ends before a certification."""
 ALIKE_GENERATIONS = 20
 """Generation at which a run says that all its centres have had the same descriptor."""
 OnGeneration = Callable[[Mapping[str, Any]], object]
@@ -87,6 +89,7 @@ def work(
     *,
     strict: bool = False,
     told: Told | None = None,
+    is_due: Callable[[Mapping[str, Any]], bool] = lambda row: False,
 ) -> OverlappedRequests[Outcome]:
     """Run generations until the budget is spent or `on_generation` returns a `Stop`. The configured engine computes
     their work, so that nothing is yielded, unless the caller does.
@@ -98,8 +101,12 @@ def work(
         strict: whether workers on another platform than the run's are an error.
         told: metrics of the caller, to whom work is yielded because the task has no episodes of its own; None: an
             engine computes.
+        is_due: returns whether the best centre is to be certified, by its `best_fitness` in a row of the history; the
+            session then ends after this generation.
     """
     task, asks_caller = task_of(config), told is not None
+    # Only what is computed again with the same bits may be lost, and only who cannot stop a run is shown several rows.
+    may_group = task.kind == "jax" and isinstance(on_generation, Observer)
     store.keep_every = config.store.keep_every
     notices, said_failed = 0, False
 
@@ -195,6 +202,8 @@ def work(
             given = answer.metrics if isinstance(answer, Stop) else answer
             if isinstance(given, Mapping) and given:
                 kept.record(row["generation"], checked_metrics(given, store.meta, "on_generation"))
+            if not isinstance(answer, Stop) and is_due(row):
+                answer = Stop(TO_CERTIFY)
             _LOG.info(
                 "%s fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
                 evaluated_word(row),
@@ -203,7 +212,6 @@ def work(
                 row["env_steps"],
                 row["steps_per_second"],
             )
-            in_generation(row["generation"] + 1)
             return answer
 
         if engine is not None:
@@ -217,7 +225,17 @@ def work(
         listening = should_stop, tell, lambda stored: log(Committed(stored))
         with patient_store(store, recorder, *listening, told or dict) as kept:
             counts = (lambda: DispatchCounts(workers=1)) if engine is None else lambda: engine.counts
-            session = driver.run(search, kept, state, after_generation, tell_failed, counts)
+            interval_s = config.store.commit_interval_s if may_group else 0.0
+            session = driver.run(
+                search,
+                kept,
+                state,
+                after_generation,
+                tell_failed,
+                counts,
+                interval_s,
+                lambda state: is_due({"best_fitness": state.best.fitness}),
+            )
             state, reason = (yield from session) if engine is None else driver.drive(session, engine)
         _LOG.info("the session ends: %s", reason)
         store.lock.note_end("" if driver.spent(config.budget, state) else reason)

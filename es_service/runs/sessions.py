@@ -20,7 +20,6 @@ from es_service.config.workload import require_episodes
 from es_service.dispatch import events
 from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
-from es_service.loop.state import Stop
 from es_service.protocol.content import Policy
 from es_service.protocol.episodes import OverlappedRequests
 from es_service.protocol.noise import Domain
@@ -39,7 +38,7 @@ from es_service.runs.certified import (
 from es_service.runs.checked_config import accepted, columns, require_resumable
 from es_service.runs.evaluation import candidates
 from es_service.runs.selection import StoredEpisodes, new_episodes
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, Told, work
+from es_service.runs.session import TO_CERTIFY, OnGeneration, OnNotice, Outcome, Told, work
 from es_service.runs.view import open_run
 from es_service.runs.waiting import telling_once, when_free
 from es_service.runs.worker_count import require_cores
@@ -58,8 +57,6 @@ from es_service.store.writer import RunStore, no_hook
 
 BEST = "best"
 """Name of the best centre among the candidates of a certification."""
-TO_CERTIFY = "the best centre may have reached budget.target_certified"
-"""Reason of the Stop that ends a session before a certification."""
 
 
 def certify_best(
@@ -146,24 +143,6 @@ def attempt(
     )
 
 
-def until_due(
-    on_generation: Callable[[Mapping[str, Any]], object], is_due: Callable[[Mapping[str, Any]], bool]
-) -> Callable[[Mapping[str, Any]], object]:
-    """`on_generation`, whose answer is a Stop once the best centre is to be certified.
-
-    Args:
-        is_due: what `due` returns.
-    """
-
-    def answer(row: Mapping[str, Any]) -> object:
-        given = on_generation(row)
-        if isinstance(given, Stop) or not is_due(row):
-            return given
-        return Stop(TO_CERTIFY, given if isinstance(given, Mapping) else {})
-
-    return answer
-
-
 def due(folder: Path, config: RunConfig) -> Callable[[Mapping[str, Any] | None], bool]:
     """Function that says of a row of the history whether `certify_best` is to be called; see `due_after`.
 
@@ -247,9 +226,8 @@ def create_run(
     ):
         begun = store.generation
         try:
-            until = until_due(on_generation, due(folder, config))
-            listening = listener.on_notice, listener.on_compile, listener.on_output
-            outcome = yield from work(config, store, until, *listening, told=listener.told)
+            listening = on_generation, listener.on_notice, listener.on_compile, listener.on_output
+            outcome = yield from work(config, store, *listening, told=listener.told, is_due=due(folder, config))
         except StartError as error:
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations
@@ -331,7 +309,6 @@ def _session(
         if (is_due := due(folder, config))(store.last_history()):
             return config, Outcome(open_run(folder), TO_CERTIFY, is_finished=False)
         with listener.shown(folder) as on_generation:
-            until = until_due(on_generation, is_due)
-            listening = listener.on_notice, listener.on_compile, listener.on_output
-            outcome = yield from work(config, store, until, *listening, strict=strict, told=listener.told)
+            listening = on_generation, listener.on_notice, listener.on_compile, listener.on_output
+            outcome = yield from work(config, store, *listening, strict=strict, told=listener.told, is_due=is_due)
             return config, outcome

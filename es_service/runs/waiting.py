@@ -2,24 +2,23 @@
 
 A viewer of SQLite databases may hold a run for as long as somebody looks at it: with a write transaction on a local
 disk, by reading alone where `run.db` has a rollback journal. That must not end a run of days. Generations are stored in
-their order, each in its transaction, so a process that is killed loses the newest of them, which the next session
-computes again with the same bits.
+their order, those that were given together in one transaction, so a process that is killed loses the newest of them,
+which the next session computes again with the same bits.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
-from es_service.loop.history import HistoryRow, Table
-from es_service.loop.state import Changes
-from es_service.protocol.content import Arrays, Contents
+from es_service.loop.state import Generation
+from es_service.protocol.content import Arrays
 from es_service.runs.identity import Recorder
 from es_service.store.folder import DATABASE
 from es_service.store.writer import RunStore
@@ -33,7 +32,6 @@ AGAIN_S = 0.5
 """Least seconds between two attempts to store what waits in memory."""
 
 Value = TypeVar("Value")
-_Generation = tuple[int, Changes, HistoryRow, Table, Contents, Mapping[str, float]]
 
 
 def when_free(act: Callable[[], Value], held: Callable[[], object]) -> Value:
@@ -74,7 +72,7 @@ class PatientStore:
         self._store, self._recorder = store, recorder
         self._should_stop, self._tell, self._on_commit = should_stop, tell, on_commit
         self._metrics_told = told
-        self._waiting: deque[tuple[int, frozenset[str], _Generation]] = deque()
+        self._waiting: deque[tuple[int, frozenset[str], Sequence[Generation]]] = deque()
         self._metrics: dict[int, Mapping[str, float]] = {}
         self._bytes, self._again_s, self._is_held = 0, 0.0, False
         self.has_failed = False
@@ -87,25 +85,24 @@ class PatientStore:
         Raises:
             Interrupted: a stop was requested while it could not be read. Otherwise as `RunStore.content`.
         """
-        for _, _, (*_, contents, _) in self._waiting:
-            if name in contents:
-                return contents[name]
+        for _, _, generations in self._waiting:
+            for one in generations:
+                if name in one.contents:
+                    return one.contents[name]
         return when_free(partial(self._store.content, name), self._pause)
 
-    def commit(
-        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table, contents: Contents
-    ) -> None:
-        """Store a generation, or let it wait in memory while another program holds the database.
+    def commit(self, generations: Sequence[Generation]) -> None:
+        """Store generations, or let them wait in memory while another program holds the database.
 
         Raises:
             Interrupted: so many generations wait that the run has paused, and a stop was requested. Otherwise as
                 `Recorder.commit`.
         """
-        given = (*parts.values(), *contents.values(), evaluations)
-        arrays = [array for part in given if part is not None for array in part.values()]
-        size = sum(array.nbytes for array in arrays)
+        given = [part for one in generations for part in (*one.parts.values(), *one.contents.values(), one.evaluations)]
+        size = sum(array.nbytes for part in given if part is not None for array in part.values())
         is_first = not self._waiting
-        taken = generation, parts, history, evaluations, contents, self._metrics_told()
+        *others, last = generations
+        taken = [*others, last._replace(recorded=self._metrics_told())]
         self._waiting.append((size, self._recorder.workers(), taken))
         self._bytes += size
         if is_first or time.monotonic() >= self._again_s:
@@ -124,13 +121,14 @@ class PatientStore:
         try:
             with self._store.patience(patience_s):
                 while self._waiting:
-                    size, workers, generation = self._waiting[0]
-                    self._recorder.commit(workers, *generation)
+                    size, workers, generations = self._waiting[0]
+                    self._recorder.commit(workers, generations)
                     self._waiting.popleft()
                     self._bytes -= size
-                    self._on_commit(generation[0])
-                    if generation[0] in self._metrics:
-                        self._record(generation[0])
+                    for one in generations:
+                        self._on_commit(one.number)
+                        if one.number in self._metrics:
+                            self._record(one.number)
                 for at in list(self._metrics):
                     self._record(at)
         except DatabaseHeldError:
@@ -156,7 +154,7 @@ class PatientStore:
 
     def lost(self) -> DatabaseHeldError:
         """The error of a session that ends while generations wait."""
-        generations = [generation for _, _, (generation, *_) in self._waiting] or list(self._metrics)
+        generations = [one.number for *_, given in self._waiting for one in given] or list(self._metrics)
         which = f"generation {generations[0]}" if len(generations) == 1 else f"{len(generations)} generations"
         again = "What is lost is computed again with the same results when the run continues"
         if not self._waiting:
@@ -182,7 +180,7 @@ class PatientStore:
     def _hold(self) -> None:
         """Say that the database is held, to the user once and to readers of the run's status each time."""
         self._is_held, self._again_s = True, time.monotonic() + AGAIN_S
-        count = len(self._waiting)
+        count = sum(len(generations) for *_, generations in self._waiting)
         self._store.lock.say(doing=f"another program holds {DATABASE}; finished generations that wait: {count:,}")
         self._say(
             f"another program holds {self._file}, which cannot be written. Finished generations wait in memory, at "

@@ -42,7 +42,7 @@ from es_service.store.folder import (
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.records import START, metric_values, record_metrics, record_platform
 from es_service.store.repair import connect
-from es_service.store.rows import insert_history
+from es_service.store.rows import insert_history, row_of_history
 from es_service.store.schema import RunMeta, create_tables, put_meta
 from es_service.store.states import insert_contents, insert_state
 
@@ -95,7 +95,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
             evaluated = [row_bytes(stored_values(meta.evaluation_columns, row)) for row in next(evaluations, ())]
             # The state of the newest generation is stored, but not those of the generations before it.
             state = state_sha256(state_sum(in_force if generation == beginning.newest else {}))
-            insert_history(connection, meta, generation, values, b"".join(evaluated), state)
+            insert_history(connection, [row_of_history(meta, generation, values, b"".join(evaluated), state)])
         for generation, platform in beginning.platforms:
             record_platform(connection, generation, platform)
         columns = {column.name for column in meta.columns}

@@ -47,14 +47,18 @@ class StoredRow(NamedTuple):
     sha256: str
 
 
-def insert_history(
-    connection: sqlite3.Connection, meta: RunMeta, generation: int, history: Row, evaluations: bytes, state: str
-) -> None:
-    """Store a history row; the arguments are those of `codec.row_values` and the fields of `StoredRow`. Raises
-    StoreError if the values do not fit the columns."""
+def row_of_history(
+    meta: RunMeta, generation: int, history: Row, evaluations: bytes, state: str
+) -> tuple[int | float | str | bytes | None, ...]:
+    """A row of the table history, as it is stored; the arguments are those of `codec.row_values` and the fields of
+    `StoredRow`. Raises StoreError if the values do not fit the columns."""
     row = row_values(meta.columns, generation, history)
-    stored = (*row, evaluations, state, row_sha256(meta.heading, row, evaluations, state))
-    connection.execute(f"INSERT INTO history VALUES ({', '.join('?' * len(stored))})", stored)
+    return (*row, evaluations, state, row_sha256(meta.heading, row, evaluations, state))
+
+
+def insert_history(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> None:
+    """Store rows that `row_of_history` has made."""
+    connection.executemany(f"INSERT INTO history VALUES ({', '.join('?' * len(rows[0]))})", rows)
 
 
 def history_rows(

@@ -12,9 +12,11 @@ are deleted together with the last row that names them.
 from __future__ import annotations
 
 import sqlite3
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import islice
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -147,19 +149,42 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
     return row[0]
 
 
+class Change(NamedTuple):
+    """What a commit changes of the stored state rows and contents."""
+
+    totals: Sequence[int]
+    """`codec.state_sum` of the state after each generation."""
+    parts: Collection[str]
+    """Those of which there are new rows."""
+    added: Mapping[tuple[str, int], str]
+    """(part, generation) -> SHA-256 or GONE of the new rows that are stored. Those of generations whose states are not
+    kept are not, where a later row of the part replaces them."""
+    outdated: Sequence[tuple[str, int]]
+    """The stored rows that are deleted."""
+    named: NamesByRow
+    """What the added rows name."""
+    runs: Mapping[bytes, int]
+    """By how much it changes in how many runs of rows a content is named."""
+    new_contents: Sequence[bytes]
+    """Names of the contents that are stored."""
+    unnamed: Sequence[bytes]
+    """Names of those that are deleted, since nothing names them any more."""
+
+
 class KeptStates:
     """The stored state rows, as the writer of a run follows them from commit to commit."""
 
     def __init__(self, connection: sqlite3.Connection, rows: KeptRows, named: NamesByRow, newest: int | None) -> None:
         """`rows`: all intact rows that are stored; `named`: what they and those of certified policies name; `newest`:
         newest generation, None if there is none."""
-        self._rows, self._named = rows, dict(named)
+        self._rows = {part: dict(sorted(of_part.items())) for part, of_part in rows.items()}
+        self._named = dict(named)
         self._count = Counter[bytes]()
         """By name of a content, in how many runs of successive rows of a part it is named: 0 if nothing names it. A new
         row names nearly the same as the one before, so few of these numbers change with it."""
         before: tuple[str, frozenset[bytes]] = "", frozenset()
         for part, at in sorted({*self._named, *((part, at) for part, of_part in rows.items() for at in of_part)}):
-            names = self._named_by(part, at)
+            names = self._named.get((part, at), frozenset())
             self._count.update(names - (before[1] if before[0] == part else frozenset()))
             before = part, names
         self.total = 0 if newest is None else state_sum(rows_in_force(rows, newest))
@@ -171,81 +196,105 @@ class KeptStates:
 
     def names(self) -> list[str]:
         """Parts of the newest state."""
-        return sorted(part for part, of_part in self._rows.items() if of_part[max(of_part)] != GONE)
+        return sorted(part for part, of_part in self._rows.items() if of_part[next(reversed(of_part))] != GONE)
 
     def newest(self, part: str) -> tuple[int, str]:
         """(generation, SHA-256) of the newest row of a part. Raises KeyError if the newest state has no such part."""
-        at, sha256 = max(self._rows[part].items())
+        at, sha256 = next(reversed(self._rows[part].items()))
         if sha256 == GONE:
             raise KeyError(part)
         return at, sha256
-
-    def total_after(self, new: ListedRows) -> int:
-        """`total` after a commit of these rows."""
-        return changed_sum(self.total, {part: max(self._rows[part].items()) for part in new if part in self._rows}, new)
-
-    def outdated(self, keep_every: int | None) -> list[tuple[str, int]]:
-        """(part, generation) of the rows that the next commit deletes: the rows that remain make up the states of its
-        generation, of the one before it, and of those to keep, such as multiples of `keep_every`."""
-        rows = []
-        for part in self._doubled:
-            at, until = sorted(self._rows[part])[-2:]
-            is_multiple = keep_every is not None and (until - 1) // keep_every * keep_every >= at
-            if not is_multiple and not any(at <= generation < until for generation in self._earlier):
-                rows.append((part, at))
-                if self._rows[part][until] == GONE and len(self._rows[part]) == 2:
-                    rows.append((part, until))
-        return rows
 
     def contents(self) -> list[bytes]:
         """Names of all contents that are stored."""
         return list(self._count)
 
-    def named_after(self, named: NamesByRow, outdated: Iterable[tuple[str, int]]) -> tuple[list[bytes], list[bytes]]:
-        """Names of the contents that a commit adds, and of those that nothing names after it.
+    def changed_by(
+        self,
+        generations: Sequence[ListedRows],
+        arrays: Mapping[tuple[str, int], Part | None],
+        last: int,
+        keep_every: int | None,
+    ) -> Change:
+        """What a commit of generations changes. The rows that remain make up the states of the last generation, of the
+        one before it, and of those to keep, such as multiples of `keep_every`.
 
         Args:
-            named: what its rows name.
-            outdated: rows that it deletes.
+            generations: the new rows of each, in their order.
+            arrays: of these rows.
+            last: number of the last generation.
         """
-        change = self._change(named, outdated)
-        added = [name for name in change if name not in self._count]
-        return added, [name for name, by in change.items() if self._count[name] + by == 0]
+        total, totals = self.total, list[int]()
+        newest: dict[str, tuple[int, str]] = {}
+        new: dict[str, dict[int, str]] = {}
+        for rows in generations:
+            replaced = {part: next(reversed(self._rows[part].items())) for part in rows if part in self._rows}
+            total = changed_sum(total, replaced | {part: newest[part] for part in rows if part in newest}, rows)
+            totals.append(total)
+            newest |= rows
+            for part, (at, sha256) in rows.items():
+                new.setdefault(part, {})[at] = sha256
+        added: dict[tuple[str, int], str] = {}
+        named: dict[tuple[str, int], frozenset[bytes]] = {}
+        outdated: list[tuple[str, int]] = []
+        count: dict[bytes, int] = {}
+        for part in {*self._doubled, *new}:
+            stored, of_part = self._rows.get(part, {}), new.get(part, {})
+            present = [*islice(reversed(stored), 3)][::-1]  # whether older ones are needed was decided long ago
+            before = present.pop(0) if len(present) > 2 else None
+            rows = [*present, *of_part]
+            wanted = [
+                at
+                for at, until in zip(rows, [*rows[1:], last + 1], strict=True)
+                if until >= last or self._is_kept(at, until, keep_every)
+            ]
+            if before is None and (of_part.get(wanted[0]) or stored.get(wanted[0])) == GONE:
+                del wanted[0]  # it removes nothing
+            added |= {(part, at): of_part[at] for at in wanted if at in of_part}
+            named |= {(part, at): names for at in wanted if (names := names_in(arrays.get((part, at)) or {}))}
+            outdated += [(part, at) for at in present if at not in wanted]
+            for ats, by in ((present, -1), (wanted, 1)):
+                earlier = self._named.get((part, before), frozenset[bytes]()) if before is not None else frozenset()
+                for at in ats:
+                    names = named.get((part, at)) or self._named.get((part, at), frozenset())
+                    for name in names - earlier:
+                        count[name] = count.get(name, 0) + by
+                    earlier = names
+        new_contents = [name for name, by in count.items() if by > 0 and name not in self._count]
+        unnamed = [name for name, by in count.items() if by < 0 and self._count[name] + by == 0]
+        return Change(totals, new, added, outdated, named, count, new_contents, unnamed)
 
-    def _named_by(self, part: str, at: int | None) -> frozenset[bytes]:
-        return frozenset() if at is None else self._named.get((part, at), frozenset())
+    def _is_kept(self, at: int, until: int, keep_every: int | None) -> bool:
+        """Whether a row is in force, from `at` to before `until`, in a state that is to be kept."""
+        if keep_every is not None and (until - 1) // keep_every * keep_every >= at:
+            return True
+        return bisect_left(self._earlier, at) < bisect_left(self._earlier, until)
 
-    def _change(self, named: NamesByRow, outdated: Iterable[tuple[str, int]]) -> Counter[bytes]:
-        """By how much `_count` changes with a commit, where it may change; arguments as of `named_after`."""
-        change = Counter[bytes]()
-        for (part, _), names in named.items():
-            change.update(names - self._named_by(part, max(self._rows.get(part, ()), default=None)))
-        for part, at in outdated:
-            rows = self._rows[part]
-            earlier = self._named_by(part, max((row for row in rows if row < at), default=None))
-            later = self._named_by(part, min((row for row in rows if row > at), default=None))
-            names = self._named_by(part, at)
-            change.subtract((names - earlier - later) | ((earlier & later) - names))
-        return change
+    def commit(self, change: Change) -> None:
+        """Follow a commit."""
+        self.total = change.totals[-1]
+        for part, at in change.outdated:
+            del self._rows[part][at]
+            self._named.pop((part, at), None)
+        for (part, at), sha256 in change.added.items():
+            self._rows.setdefault(part, {})[at] = sha256
+        for part in {part for part, _ in change.outdated}:
+            if not self._rows[part]:
+                del self._rows[part]
+        self._doubled = [part for part in change.parts if len(self._rows.get(part, ())) > 1]
+        self._add(change.named, change.runs)
 
-    def add_named(self, named: NamesByRow, outdated: Iterable[tuple[str, int]] = ()) -> None:
-        """Follow what new rows name, of the state or of certified policies; arguments as of `named_after`."""
-        for name, by in self._change(named, outdated).items():
+    def lacking(self, named: NamesByRow) -> list[bytes]:
+        """Names of the contents that are not stored."""
+        return [name for name in frozenset[bytes]().union(*named.values()) if name not in self._count]
+
+    def add_certified(self, named: NamesByRow) -> None:
+        """Follow what new rows of certified policies name."""
+        self._add(named, Counter(name for names in named.values() for name in names))
+
+    def _add(self, named: NamesByRow, count: Mapping[bytes, int]) -> None:
+        self._named |= named
+        for name, by in count.items():
             self._count[name] += by
             if not self._count[name]:
                 del self._count[name]
-        for row in outdated:
-            self._named.pop(row, None)
-        self._named |= named
-
-    def commit(self, new: ListedRows, named: NamesByRow, outdated: Iterable[tuple[str, int]], total: int) -> None:
-        """Follow a commit, with what `total_after` and `outdated` have returned for it."""
-        self.total = total
-        self.add_named(named, outdated)
-        for part, at in outdated:
-            del self._rows[part][at]
-            if not self._rows[part]:
-                del self._rows[part]
-        for part, (at, sha256) in new.items():
-            self._rows.setdefault(part, {})[at] = sha256
-        self._doubled = [part for part in new if len(self._rows[part]) > 1]

@@ -1,4 +1,5 @@
-"""The writer of the run store: one transaction per generation, so that `kill -9` loses only the unfinished generation.
+"""The writer of the run store: a transaction for a generation, or for some that have ended within a short time, so that
+`kill -9` loses at most these and the unfinished one.
 
 A run is a folder with `config.yaml`, `run.db` (SQLite), `run.lock`, and after some minutes `run.db.copy`. On a local
 disk `run.db` is in WAL mode: a killed process loses nothing that was committed, and a power cut loses at most the
@@ -11,17 +12,18 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Self
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
-from es_service.loop.history import LATER, Row, Table
+from es_service.loop.history import LATER
+from es_service.loop.state import Generation
 from es_service.protocol.child import require_same_process
 from es_service.protocol.content import names_in
 from es_service.store.codec import Part, encode_changes, row_dict, rows_listed, state_sha256
@@ -40,13 +42,12 @@ from es_service.store.records import (
     store_platform_list,
 )
 from es_service.store.repair import open_sound, patience
-from es_service.store.rows import history_rows, insert_history, table_bytes
+from es_service.store.rows import history_rows, insert_history, row_of_history, table_bytes
 from es_service.store.schema import EXTENDED_SCHEMA, SCHEMA, RunMeta, put_meta
 from es_service.store.states import KeptStates, insert_contents, insert_state, sound_content, sound_part
 from es_service.store.upkeep import Upkeep
 
 _LOG = logger(__name__)
-NO_ROWS: Table = {}
 NOTHING = Beginning()
 """Beginning of an ordinary run."""
 
@@ -169,61 +170,53 @@ class RunStore:
                     ways_out=[WayOut("resume", "fall back to the newest intact generation", str(self.folder))],
                 ) from damage
 
-    def commit(
-        self,
-        generation: int,
-        parts: Mapping[str, Part | None],
-        history: Row,
-        evaluations: Table = NO_ROWS,
-        contents: Mapping[bytes, Part] = MappingProxyType({}),
-        recorded: Mapping[str, float] = MappingProxyType({}),
-    ) -> None:
-        """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
-
-        Args:
-            generation: the generation after `self.generation`, or 0 if that is None.
-            parts: parts of the state that have changed, None for those that are removed; the others keep their values.
-            history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
-            evaluations: likewise for the centres that the generation evaluated, in the order of the asks: a table.
-            contents: contents by name, among them those that the parts name and that are not stored yet.
-            recorded: metrics that a caller has told, by name; they are no columns.
+    def commit(self, generations: Sequence[Generation]) -> None:
+        """Store generations in one transaction. If this raises, the store is unchanged and can still be used.
 
         Raises:
-            DatabaseHeldError: another program holds the database. StoreError: the generation is not the next one, the
+            DatabaseHeldError: another program holds the database. StoreError: the generations are not the next ones, a
                 history does not fit the columns, a part names a content that nobody has, or the disk is full.
         """
-        if lacking := LATER - {column.name for column in self.meta.columns}:
-            history = {name: value for name, value in history.items() if name not in lacking}
-        expected = 0 if self.generation is None else self.generation + 1
-        if generation != expected:
-            raise StoreError(f"{self.folder}: cannot store generation {generation}; the next generation is {expected}")
-        rows = encode_changes(generation, parts)
-        new = rows_listed(rows)
-        centres = table_bytes(self.meta.evaluation_columns, evaluations)
-        total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
-        named = {(part, generation): names for part, arrays in parts.items() if (names := names_in(arrays or {}))}
-        added, unnamed = self._kept.named_after(named, outdated)
-        self._require_known(added, contents, f"generation {generation}")
+        next_one = 0 if self.generation is None else self.generation + 1
+        numbers = [one.number for one in generations]
+        if numbers != [*range(next_one, next_one + len(numbers))] or not numbers:
+            said = ", ".join(map(str, numbers)) or "none"
+            raise StoreError(f"{self.folder}: cannot store generation {said}; the next generation is {next_one}")
+        rows = [encode_changes(one.number, one.parts) for one in generations]
+        arrays = {(part, one.number): arrays for one in generations for part, arrays in one.parts.items()}
+        change = self._kept.changed_by([*map(rows_listed, rows)], arrays, numbers[-1], self.keep_every)
+        contents = ChainMap(*(dict(one.contents) for one in generations))
+        which = f"generation {next_one}" if len(numbers) == 1 else f"generations {next_one} to {numbers[-1]}"
+        self._require_known(change.new_contents, contents, which)
+        history = [self._history_row(*of_one) for of_one in zip(generations, change.totals, strict=True)]
         self._hook("before_begin")
-        with self._transaction(f"storing generation {generation}") as connection:
+        with self._transaction(f"storing {which}") as connection:
             # Delete first, so that the new rows use the pages of the old ones.
-            connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
-            connection.executemany("DELETE FROM content WHERE name = ?", [(name,) for name in unnamed])
-            insert_state(connection, rows)
-            insert_contents(connection, ((name, contents[name]) for name in added))
+            connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", change.outdated)
+            connection.executemany("DELETE FROM content WHERE name = ?", [(name,) for name in change.unnamed])
+            insert_state(connection, (row for of_one in rows for row in of_one if row[:2] in change.added))
+            insert_contents(connection, ((name, contents[name]) for name in change.new_contents))
             self._hook("mid_transaction")
-            insert_history(connection, self.meta, generation, history, centres, state_sha256(total))
-            if recorded:
-                record_metrics(connection, generation, recorded)
+            insert_history(connection, history)
+            for one in generations:
+                if one.recorded:
+                    record_metrics(connection, one.number, one.recorded)
             if self._recorded:
                 store_platform_list(connection)
             self._hook("before_commit")
         self._recorded = False
-        self.generation = generation
-        self._kept.commit(new, named, outdated, total)
+        self.generation = numbers[-1]
+        self._kept.commit(change)
         self._hook("after_commit")
-        _LOG.debug("stored generation %d: %d parts", generation, len(rows))
+        _LOG.debug("stored %s: %d parts", which, len(change.added))
         self.upkeep.after_commit()
+
+    def _history_row(self, one: Generation, total: int) -> tuple[Any, ...]:
+        """The history row of a generation after which the state has this `state_sum`."""
+        lacking = LATER - {column.name for column in self.meta.columns}
+        history = {name: value for name, value in one.history.items() if name not in lacking}
+        evaluations = table_bytes(self.meta.evaluation_columns, one.evaluations)
+        return row_of_history(self.meta, one.number, history, evaluations, state_sha256(total))
 
     def _require_known(self, added: Sequence[bytes], contents: Mapping[bytes, Part], what: str) -> None:
         """Raise StoreError if a name that is not stored yet is not among the contents."""
@@ -278,7 +271,7 @@ class RunStore:
         """
         number = self.next_certification
         named = {row_name(number, rank): names_in(arrays) for rank, (_, arrays) in enumerate(policies)}
-        added, _ = self._kept.named_after(named, ())
+        added = self._kept.lacking(named)
         self._require_known(added, contents, f"certification {number}")
         with self._transaction("storing a certification") as connection:
             put_meta(connection, SCHEMA, str(EXTENDED_SCHEMA))
@@ -286,7 +279,7 @@ class RunStore:
             self._hook("mid_transaction")
             insert_certification(connection, number, policies)
             self._hook("before_commit")
-        self._kept.add_named(named)
+        self._kept.add_certified(named)
         self._hook("after_commit")
         self.upkeep.after_commit()
 

@@ -39,7 +39,7 @@ DRIVER = {
     "ES, 64 pairs": ("es", {"pairs": 64}),
 }
 """Cases of --driver: name -> (algorithm, its settings)."""
-FIRST, LAST = 10, 210
+FIRST, LAST = 10, 410
 """Generations between which --driver measures."""
 PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
@@ -95,7 +95,7 @@ def measure(
         if row["generation"] == max(1, generations - 1):
             mib = family_mib()
 
-    history = api.run(config, folder, on_generation=look).run.history
+    history = api.run(config, folder, on_generation=api.Observer(look)).run.history
     history = history.iloc[10:] if generations > 10 else history
     parts = {part: float(history[f"seconds_{part}"].median() * 1000) for part in PARTS}
     whole = sum(parts.values())
@@ -132,7 +132,7 @@ def driver_ms(algorithm: str, settings: dict[str, int], folder: Path) -> float:
         if row["generation"] in (FIRST, LAST):
             at[row["generation"]] = time.process_time()
 
-    api.run(config, folder, on_generation=look)
+    api.run(config, folder, on_generation=api.Observer(look))  # a few generations late, at both ends
     return round((at[LAST] - at[FIRST]) * 1000 / (LAST - FIRST), 2)
 
 

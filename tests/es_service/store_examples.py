@@ -11,6 +11,7 @@ import numpy as np
 
 from es_service.config.model import COMPUTE_CONSTANTS
 from es_service.loop.history import NO_INTEGER, Column
+from es_service.loop.state import Generation
 from es_service.protocol.content import NO_NAME, name_of, names, names_in
 from es_service.store import upkeep as store_upkeep
 from es_service.store.codec import decode_part
@@ -169,20 +170,23 @@ def evaluated_table(generation):
     return as_table(EVALUATION_COLUMNS, evaluated(generation))
 
 
-def create(folder, *, seed=0, generations=0, hook=no_hook, run_meta=None):
+def create(folder, *, seed=0, generations=0, hook=no_hook, run_meta=None, together=1):
     store = RunStore.create(Path(folder), CONFIG_YAML, run_meta or meta(), hook=hook)
-    advance(store, generations - 1, seed=seed)
+    advance(store, generations - 1, seed=seed, together=together)
     return store
 
 
-def advance(store, last, *, seed=0):
-    """Commit generations up to and including `last`."""
+def generation_of(number, seed=0):
+    """What is stored of a generation."""
+    parts, contents = parts_of(number, seed), contents_of(number, seed)
+    return Generation(number, parts, history_row(number), evaluated_table(number), contents)
+
+
+def advance(store, last, *, seed=0, together=1):
+    """Commit generations up to and including `last`, so many in a transaction."""
     first = 0 if store.generation is None else store.generation + 1
-    for generation in range(first, last + 1):
-        contents = contents_of(generation, seed)
-        store.commit(
-            generation, parts_of(generation, seed), history_row(generation), evaluated_table(generation), contents
-        )
+    for begin in range(first, last + 1, together):
+        store.commit([generation_of(at, seed) for at in range(begin, min(begin + together, last + 1))])
 
 
 def finished(folder, generations, seed=0):

@@ -1,6 +1,6 @@
 """Run as a program: write to a run and be killed by SIGKILL at a named instant. Each job is a forked child.
 
-python -m tests.es_service.store_killer FOLDER  < lines "job name instant count"
+python -m tests.es_service.store_killer FOLDER  < lines "job name instant count together"
 """
 
 import math
@@ -51,7 +51,7 @@ def die_at_file_operation(count):
 def main():
     root = Path(sys.argv[1])
     for line in sys.stdin:
-        job, name, instant, count = line.split()
+        job, name, instant, count, together = line.split()
         child = os.fork()
         if child == 0:
             folder = root / name
@@ -65,7 +65,7 @@ def main():
                     if job == "network":
                         # Pages go to the file before the end of the transaction: its journal must be rolled back.
                         run._connection.execute("PRAGMA cache_size = 1")
-                    advance(run, GENERATIONS - 1)
+                    advance(run, GENERATIONS - 1, together=int(together))
             elif job == "create":
                 die_at_file_operation(int(count))
                 create(folder).close()

@@ -15,6 +15,7 @@ from es_service.dispatch.waits import Computing
 from es_service.loop import budget, driver
 from es_service.loop.budget import durations, only_started, spent
 from es_service.loop.history import LATER
+from es_service.loop.state import Generation
 from es_service.runs.run_status import more, read_status, state
 from es_service.store.writer import RunStore
 from tests.run_examples import write_run
@@ -108,7 +109,7 @@ def test_a_run_without_the_columns_of_later_versions_goes_on_without_them(tmp_pa
     RunStore.create(tmp_path / "older", "", older).close()
     with RunStore.open(tmp_path / "older") as store:
         names = {column.name for column in meta.columns}
-        store.commit(0, {}, dict.fromkeys(names - {"generation"}))
+        store.commit([Generation(0, {}, dict.fromkeys(names - {"generation"}))])
         assert "rollout_s" not in store.last_history()
 
 

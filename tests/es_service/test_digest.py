@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.loop.state import Generation
 from es_service.protocol.content import name_of
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
@@ -88,7 +89,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
                 for part, arrays in reversed(parts_of(generation).items())
             }
             row, centres = history_row(generation), evaluated_table(generation)
-            store.commit(generation, parts, row, centres, contents_of(generation))
+            store.commit([Generation(generation, parts, row, centres, contents_of(generation))])
     assert digest(tmp_path / "other") == expected
     execute(tmp_path / "other", "VACUUM")
     assert digest(tmp_path / "other") == expected
@@ -97,7 +98,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
 def test_when_a_part_was_last_written_does_not_count(folder, tmp_path):
     with create(tmp_path / "all", generations=GENERATIONS - 1) as store:
         last = GENERATIONS - 1
-        store.commit(last, state_at(last), history_row(last), evaluated_table(last), contents_of(last))
+        store.commit([Generation(last, state_at(last), history_row(last), evaluated_table(last), contents_of(last))])
     assert digest(tmp_path / "all") == digest(folder)
 
 
@@ -254,6 +255,6 @@ def test_every_part_of_the_map_counts(tmp_path, part):
         parts = {name: {"x": np.zeros(3, np.float32)} for name in ("map/geometry", "map#000000", "map#000003")}
         parts[part]["x"][1] = changed
         with create(tmp_path / str(changed)) as store:
-            store.commit(0, state_at(0) | parts, history_row(0), contents=contents_of(0))
+            store.commit([Generation(0, state_at(0) | parts, history_row(0), contents=contents_of(0))])
         found.append(digest_parts(tmp_path / str(changed)))
     assert {name for name in found[0] if found[0][name] != found[1][name]} == {"map"}

@@ -229,7 +229,7 @@ def test_chunks_are_sent_when_an_evaluation_begins_and_their_results_can_be_left
         sent = len(transport.sent)
         wait = engine.begin(with_subject(SECOND, CHUNKS))
         assert len(transport.sent) > sent
-        assert wait() == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert wait(math.inf) == [expected(SECOND, chunk) for chunk in CHUNKS]
         engine.begin(with_subject(SECOND, CHUNKS))
         assert engine.evaluate(with_subject(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert engine._results == {}

@@ -290,9 +290,9 @@ from tests.es_service.test_metrics import asks_and_tells
 
 commit = RunStore.commit
 
-def and_die(store, generation, *given):
-    commit(store, generation, *given)
-    if generation == 2:
+def and_die(store, generations):
+    commit(store, generations)
+    if [one.number for one in generations] == [2]:
         os.kill(os.getpid(), signal.SIGKILL)
 
 RunStore.commit = and_die

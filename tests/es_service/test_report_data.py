@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from es_service.cli.main import app
 from es_service.errors import StoreError
+from es_service.loop.state import Generation
 from es_service.protocol.machine import CODE, code_text
 from es_service.report import series, summary
 from es_service.report.data import read_run
@@ -292,7 +293,7 @@ def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
         def kept(meta, part, arrays):
             if not committed:
                 following = {**row, "generation": 21, "best_fitness": 0.0}
-                store.commit(21, {"best": {**parts["best"], "fitness": np.asarray(0.0)}}, following, [])
+                store.commit([Generation(21, {"best": {**parts["best"], "fitness": np.asarray(0.0)}}, following)])
                 committed.append(part)
             return arrays
 

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from es_service.errors import RunLockedError, StoreError, WayOut
+from es_service.loop.state import Generation
 from es_service.store import lock as run_lock
 from es_service.store.lock import acquire_lock, last_end, lock_holder
 from es_service.store.writer import RunStore
@@ -25,7 +26,13 @@ def test_a_second_writer_is_told_who_writes_and_how_to_watch(tmp_path):
         assert info.value.way_out == WayOut("watch", "watch it", str(folder))
         assert "; that is this process itself: leave its block of `ask_tell`, or wait" in str(info.value)
         assert "stop that process" not in str(info.value)
-        store.commit(1, {}, dict.fromkeys(("env_steps", "centre_fitness_mean", "goal_distance", "seconds_rollout"), 1))
+        store.commit(
+            [
+                Generation(
+                    1, {}, dict.fromkeys(("env_steps", "centre_fitness_mean", "goal_distance", "seconds_rollout"), 1)
+                )
+            ]
+        )
     RunStore.open(folder).close()
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from es_service.errors import StoreError, WayOut
 from es_service.loop.history import Column
+from es_service.loop.state import Generation
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
 from es_service.store.create import Beginning
@@ -148,18 +149,18 @@ def test_only_the_next_generation_can_be_committed(tmp_path):
     with create(tmp_path / "run", generations=3) as run:
         for wrong in (0, 2, 4):
             with pytest.raises(StoreError, match=f"cannot store generation {wrong}; the next generation is 3"):
-                run.commit(wrong, parts_of(wrong), history_row(wrong))
+                run.commit([Generation(wrong, parts_of(wrong), history_row(wrong))])
         advance(run, 3)
 
 
 def test_what_does_not_fit_leaves_the_store_as_it_was(tmp_path):
     with create(tmp_path / "run", generations=3) as run:
         with pytest.raises(StoreError, match="missing columns"):
-            run.commit(3, parts_of(3), {}, contents=contents_of(3))
+            run.commit([Generation(3, parts_of(3), {}, contents=contents_of(3))])
         with pytest.raises(StoreError, match=r"generation 3 names [0-9a-f]{64}, which nobody has"):
-            run.commit(3, parts_of(3), history_row(3))
+            run.commit([Generation(3, parts_of(3), history_row(3))])
         with pytest.raises(StoreError, match="dtype"):
-            run.commit(3, {"centre_0": {"a": "text"}}, history_row(3))
+            run.commit([Generation(3, {"centre_0": {"a": "text"}}, history_row(3))])
         assert_same_state(run.load(), state_at(2))
         advance(run, 3)
         assert_same_state(run.load(), state_at(3))
@@ -238,7 +239,7 @@ def test_the_log_of_a_small_run_stays_small(tmp_path):
         folder, largest = tmp_path / name, 0
         with create(folder) as run:
             for generation in range(40):
-                run.commit(generation, elites, history_row(generation), evaluated_table(generation))
+                run.commit([Generation(generation, elites, history_row(generation), evaluated_table(generation))])
                 largest = max(largest, (folder / "run.db-wal").stat().st_size)
         a_generation = 1.5 * sum(part["x"].nbytes for part in elites.values())
         assert largest < store_upkeep.LEAST_LOG_BYTES + a_generation, name

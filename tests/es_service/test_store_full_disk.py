@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.loop.state import Generation
 from es_service.store.folder import explained
 from es_service.store.reader import read_history, read_parts
 from es_service.store.writer import RunStore
@@ -33,7 +34,7 @@ def test_a_full_database_stops_the_commit_and_keeps_the_rest(tmp_path):
         connection.execute(f"PRAGMA max_page_count = {pages}")
         big = {"centre_0": {"centre_D": np.zeros(100_000, np.float32)}}
         with pytest.raises(StoreError, match=r"disk full while storing generation 3 .* free space\.\n.* resume\("):
-            run.commit(3, big, history_row(3))
+            run.commit([Generation(3, big, history_row(3))])
         assert run.generation == 2
         assert_same_state(run.load(), state_at(2))
         connection.execute("PRAGMA max_page_count = 1000000")

@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from es_service.errors import StoreError
+from es_service.store.folder import DATABASE
 from es_service.store.reader import read_kept, read_parts
 from es_service.store.writer import RunStore
-from tests.database import execute
+from tests.database import database, execute
 from tests.es_service.store_examples import (
     advance,
     assert_policies,
@@ -18,8 +19,11 @@ from tests.es_service.store_examples import (
     create,
     digest,
     finished,
+    generation_of,
     state_at,
 )
+
+STORED = ("state", "content", "history")
 
 
 def kept(folder):
@@ -43,6 +47,36 @@ def test_states_are_kept_sparsely_and_the_last_two_always(tmp_path):
     with pytest.raises(StoreError, match=r"keeps the states of generations \[0, 4, 8, 12, 13, 14\]") as caught:
         read_parts(tmp_path / "run", 5)
     assert caught.value.suggestion == 14
+
+
+@pytest.mark.parametrize("keep_every", [None, 4])
+@pytest.mark.parametrize("together", [2, 3, 7, 20])
+def test_generations_of_one_transaction_leave_what_they_leave_one_by_one(tmp_path, keep_every, together):
+    """Row by row, in all tables; also where parts come, change and go, and policies come back, in one transaction."""
+    left = []
+    for folder, count in ((tmp_path / "alone", 1), (tmp_path / "together", together)):
+        with create(folder) as store:
+            store.keep_every = keep_every
+            for last in (2, 15, 19):
+                advance(store, last, together=count)
+        with database(folder / DATABASE) as connection:
+            left.append({table: sorted(connection.execute(f"SELECT * FROM {table}")) for table in STORED})
+    assert left[0] == left[1]
+    assert_sound(tmp_path / "together", 19)
+
+
+def test_generations_of_one_transaction_are_the_next_ones_and_all_or_none(tmp_path):
+    with create(tmp_path / "run", generations=3) as store:
+        for wrong in ([], [4, 5], [3, 5], [3, 3], [4, 3]):
+            with pytest.raises(StoreError, match="; the next generation is 3"):
+                store.commit([generation_of(number) for number in wrong])
+        *some, last = (generation_of(number) for number in (3, 4, 5))
+        with pytest.raises(StoreError, match=r"generations 3 to 5 names [0-9a-f]{64}, which nobody has"):
+            store.commit([*some, last._replace(contents={})])
+        assert store.generation == 2
+        assert_same_state(store.load(), state_at(2))
+        store.commit([*some, last])
+    assert_sound(tmp_path / "run", 5)
 
 
 def test_nothing_else_stays_in_the_file(tmp_path):

@@ -50,31 +50,34 @@ def killed(tmp_path, jobs):
     return {name for name, end in ends.items() if end == "killed"}
 
 
-# A checkpoint follows each generation.
+# A checkpoint follows each transaction. Of one generation, or of three.
 KILLS = [
-    *(("opened", count, -1) for count in (1,)),
-    *((hook, count, count - 2) for hook in ("before_begin", "mid_transaction", "before_commit") for count in (1, 2, 5)),
-    *(("after_commit", count, count - 1) for count in (1, 2, 6)),
+    ("opened", 1, 1, -1),
+    *((hook, count, 1, count - 2) for hook in ("before_begin", "mid_transaction", "before_commit") for count in (1, 5)),
+    *(("after_commit", count, 1, count - 1) for count in (1, 6)),
+    *((hook, 2, 3, 2) for hook in ("before_begin", "mid_transaction", "before_commit")),
+    *(("after_commit", count, 3, 3 * count - 1) for count in (1, 2)),
 ]
+"""(instant, how often it is reached, generations of a transaction, newest generation then)."""
 
 
 @pytest.mark.slow
-def test_a_killed_writer_loses_the_generation_in_flight_and_nothing_else(tmp_path):
-    jobs = [("hook", f"{hook}-{count}", hook, count) for hook, count, _ in KILLS]
+def test_a_killed_writer_loses_the_transaction_in_flight_and_nothing_else(tmp_path):
+    jobs = [("hook", "-".join(map(str, job[:3])), *job[:3]) for job in KILLS]
     checkpoints = [
-        (f"{hook}-{count}", hook, count) for hook in ("before_checkpoint", "after_checkpoint") for count in (1, 2)
+        (f"{hook}-{count}", hook, count, 1) for hook in ("before_checkpoint", "after_checkpoint") for count in (1, 2)
     ]
     jobs += [("hook", *checkpoint) for checkpoint in checkpoints]
     assert killed(tmp_path, jobs) == {job[1] for job in jobs}
     expected_digest = digest(finished(tmp_path / "uninterrupted", GENERATIONS))
-    for hook, count, generation in KILLS:
-        assert_sound(tmp_path / f"{hook}-{count}", generation)
-    reached = {name: read_generation(tmp_path / name) for name, _, _ in checkpoints}
+    for hook, count, together, generation in KILLS:
+        assert_sound(tmp_path / f"{hook}-{count}-{together}", generation)
+    reached = {name: read_generation(tmp_path / name) for name, *_ in checkpoints}
     assert reached["before_checkpoint-1"] == reached["after_checkpoint-1"]
     assert reached["before_checkpoint-1"] < reached["before_checkpoint-2"] <= GENERATIONS - 1
     for name, generation in reached.items():
         assert_sound(tmp_path / name, generation)
-    for _, name, _, _ in jobs:
+    for _, name, *_ in jobs:
         with RunStore.open(tmp_path / name) as run:
             advance(run, GENERATIONS - 1)
         assert digest(tmp_path / name) == expected_digest
@@ -86,7 +89,7 @@ def test_a_creation_killed_at_any_file_operation_can_be_continued_or_repeated(tm
     for name in names:
         if name.startswith("existing"):
             (tmp_path / name).mkdir()
-    died = killed(tmp_path, [("create", name, "-", name.split("-")[1]) for name in names])
+    died = killed(tmp_path, [("create", name, "-", name.split("-")[1], 1) for name in names])
     assert {"new-1", "new-10", "existing-1", "existing-10"} <= died < set(names)
     outcomes = set()
     for name in names:
@@ -121,7 +124,7 @@ def test_a_repair_killed_at_any_file_operation_can_be_done_again(tmp_path, monke
     names = [f"open-{count}" for count in range(1, 40)]
     for name in names:
         shutil.copytree(tmp_path / "killed", tmp_path / name)
-    died = killed(tmp_path, [("open", name, "-", name.split("-")[1]) for name in names])
+    died = killed(tmp_path, [("open", name, "-", name.split("-")[1], 1) for name in names])
     assert {"open-1", "open-10"} <= died < set(names)
     for name in names:
         with RunStore.open(tmp_path / name) as run:
@@ -159,10 +162,10 @@ def test_on_a_network_a_killed_writer_loses_no_more(tmp_path, monkeypatch):
     for module in (store, reader):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
     jobs = [job for job in KILLS if job[1] > 1]
-    died = killed(tmp_path, [("network", f"{hook}-{count}", hook, count) for hook, count, _ in jobs])
+    died = killed(tmp_path, [("network", "-".join(map(str, job[:3])), *job[:3]) for job in jobs])
     assert len(died) == len(jobs)
-    for hook, count, generation in jobs:
-        folder = tmp_path / f"{hook}-{count}"
+    for hook, count, together, generation in jobs:
+        folder = tmp_path / f"{hook}-{count}-{together}"
         before = {path.name: path.read_bytes() for path in folder.iterdir()}
         # A journal to be rolled back sends readers to the copy, which here is as new.
         assert ("run.db-journal" in before) is (hook in ("mid_transaction", "before_commit"))

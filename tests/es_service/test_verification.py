@@ -47,7 +47,7 @@ class Worker(DirectEvaluator):
 
     def begin(self, work):
         results = self.evaluate(work)
-        return lambda: results
+        return lambda most_s: results
 
     def evaluate(self, work):
         self.generations.update(chunk.generation for _, chunk in work)

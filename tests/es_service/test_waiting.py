@@ -23,8 +23,7 @@ from tests.es_service.store_examples import (
     contents_of,
     create,
     digest,
-    evaluated_table,
-    history_row,
+    generation_of,
     parts_of,
     policy,
 )
@@ -142,8 +141,8 @@ class OneKind:
     def workers(self):
         return frozenset()
 
-    def commit(self, workers, *generation):
-        self._store.commit(*generation)
+    def commit(self, workers, generations):
+        self._store.commit(generations)
 
 
 @contextlib.contextmanager
@@ -161,8 +160,7 @@ def held(folder, tell=lambda notice: None, should_stop=lambda: None, generations
 
 def give(patient, first, last):
     for generation in range(first, last + 1):
-        row = history_row(generation)
-        patient.commit(generation, parts_of(generation), row, evaluated_table(generation), contents_of(generation))
+        patient.commit([generation_of(generation)])
 
 
 def test_the_loop_reads_policies_whether_they_wait_or_not(tmp_path):

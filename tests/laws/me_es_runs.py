@@ -80,10 +80,11 @@ class Remembering(MemoryStore):
         super().__init__()
         self.after, self.evaluated = [], []
 
-    def commit(self, generation, parts, history, evaluations, contents):
-        super().commit(generation, parts, history, evaluations, contents)
-        self.after.append(dict(self.parts))
-        self.evaluated.append(rows_of(evaluations))
+    def commit(self, generations):
+        for one in generations:
+            super().commit([one])
+            self.after.append(dict(self.parts))
+            self.evaluated.append(rows_of(one.evaluations))
 
 
 def first_centres(config):

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from es_service.loop.blocks import changes, names_of, new_names, state_of, stored
-from es_service.loop.state import Best, RunState
+from es_service.loop.state import Best, Generation, RunState
 from es_service.protocol.content import name_of, names
 from es_service.protocol.messages import Moments
 from es_service.search.algorithms.base import SearchState, frozen
@@ -222,9 +222,14 @@ def reference(state: RunState):
     return stored(state)
 
 
-def commit(store, state, before):
-    blocks, row = changes(state, before), history_row(state.generation)
-    store.commit(state.generation, blocks, row, evaluated_table(state.generation), POLICIES)
+def commit(store, states, before):
+    """Commit states in one transaction, of which the first comes after `before`."""
+
+    def stored_of(now, then):
+        row, evaluations = history_row(now.generation), evaluated_table(now.generation)
+        return Generation(now.generation, changes(now, then), row, evaluations, POLICIES)
+
+    store.commit([stored_of(now, then) for then, now in pairwise([before, *states])])
 
 
 def loaded(folder, generation):
@@ -259,23 +264,25 @@ seeds = st.integers(0, 2**32)
 @settings(max_examples=20, deadline=None)
 @given(courses, seeds, st.sampled_from([None, 2, 3]), st.sets(st.integers(0, GENERATIONS - 1)), st.data())
 def test_every_kept_generation_is_the_reference_whatever_happened(tmp_path_factory, course, seed, keep, reopened, data):
-    """Some commits are killed and repeated by another process, which continues from what is stored."""
+    """Some commits are killed and repeated by another process, which continues from what is stored; some have several
+    generations."""
     states, folder = every_state(seed, course), tmp_path_factory.mktemp("states") / "run"
     store, before, expected = create(folder), None, [*map(reference, states)]
-    for generation, state in enumerate(states):
-        if generation in reopened:
+    while (generation := 0 if store.generation is None else store.generation + 1) < GENERATIONS:
+        together = states[generation : generation + data.draw(st.integers(1, 3))]
+        if reopened.intersection(one.generation for one in together):
             instant = data.draw(st.sampled_from(["before_begin", "mid_transaction", "before_commit"]))
             store._hook = kill_at(instant)
             with pytest.raises(Killed):
-                commit(store, state, before)
+                commit(store, together, before)
             store.close()
             store = RunStore.open(folder)
             assert store.notices == []
             before = loaded(folder, generation - 1) if generation else None
         store.keep_every = keep
-        commit(store, state, before)
-        before = state
-        assert_same_state(store.load(), expected[generation])
+        commit(store, together, before)
+        before = together[-1]
+        assert_same_state(store.load(), expected[before.generation])
         assert_policies_of(folder, [states[at] for at in read_kept(folder)[1]])
     newest = GENERATIONS - 1
     kept = read_kept(folder)[1]

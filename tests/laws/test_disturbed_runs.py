@@ -22,6 +22,7 @@ from es_service import api
 from es_service.config.keys import has_effect
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
+from es_service.protocol.episodes import Wait
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
@@ -75,7 +76,7 @@ def config_of(name: str, **compute: object) -> dict:
     return config | {
         **{section: config.get(section, {}) | settings for section, settings in changes.items()},
         "budget": {"generations": GENERATIONS},
-        "store": {"keep_every": KEPT},
+        "store": {"keep_every": KEPT, "commit_interval_s": 0},
         "compute": config["compute"] | changes.get("compute", {}) | used | compute,
     }
 
@@ -149,13 +150,13 @@ class FaultyWorkers:
 class Shuffling(Engine[FaultyWorkers]):
     """Sends the chunks out in any order."""
 
-    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+    def begin(self, work: Sequence[Work]) -> Wait:
         order = self.transport.rng.sample(range(len(work)), len(work))
         wait = super().begin([work[i] for i in order])
 
-        def in_order() -> list[ChunkResult]:
-            results = dict(zip(order, wait(), strict=True))
-            return [results[i] for i in range(len(work))]
+        def in_order(most_s: float) -> list[ChunkResult] | None:
+            results = wait(most_s)
+            return None if results is None else [result for _, result in sorted(zip(order, results, strict=True))]
 
         return in_order
 
@@ -174,12 +175,29 @@ def whole(request, tmp_path_factory, workers_here):
         nonlocal committed
         generation = committed + 1
         committed += at == "after_commit"
-        if (at in KILLS and generation == 0) or at == KILLS[generation % len(KILLS)]:
+        if at == KILLS[generation % len(KILLS)]:
             kills.append((committed, folder / f"killed {at} of {generation}"))
             shutil.copytree(folder / "run", kills[-1][1])
 
     run = api.run(api.load_config(config_of(request.param)), folder / "run", hook=leave_a_copy).run
     return request.param, run, kills
+
+
+@pytest.fixture(scope="module")
+def grouped(whole, tmp_path_factory):
+    """Folders as a kill at the first and at the last transaction would leave them, of which most have several
+    generations."""
+    folder, kills = tmp_path_factory.mktemp("grouped"), {}
+
+    def leave_a_copy(at: str) -> None:
+        if at in KILLS:
+            kills[at] = folder / f"killed {at}"
+            shutil.rmtree(kills[at], ignore_errors=True)
+            shutil.copytree(folder / "run", kills[at])
+
+    config = config_of(whole[0])
+    config["store"] |= {"commit_interval_s": 0.05}
+    return api.run(api.load_config(config), folder / "run", hook=leave_a_copy).run.folder, [*kills.values()]
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
@@ -206,12 +224,19 @@ def test_any_number_order_loss_and_retry_of_workers_gives_the_same_bits(whole, t
     assert set(seen) == set(FAULTS)
 
 
-def test_killed_at_any_commit_and_resumed_it_ends_with_the_same_bits(whole):
-    """Before a transaction, in its middle, before and after its commit: all at the first one, then each in its turn."""
+def test_killed_at_any_commit_and_resumed_it_ends_with_the_same_bits(whole, grouped):
+    """Before a transaction, in its middle, before and after its commit: each in its turn. And all at the last one of a
+    run that stores several generations in one."""
     _, run, kills = whole
-    assert [generation for generation, _ in kills] == [-1, -1, -1, 0, 0, 1, 3, 3, 4, 5]
+    assert [generation for generation, _ in kills] == [-1, 0, 1, 3, 3, 4, 5]
     for generation, folder in kills:
         assert read_generation(folder) == (None if generation < 0 else generation)
+    together, of_group = grouped
+    assert digest_parts(together) == digest_parts(run.folder)
+    *before, after = map(read_generation, of_group)
+    assert len({*before}) == 1
+    assert after == GENERATIONS
+    for folder in (*(folder for _, folder in kills), *of_group[:-1]):
         assert api.resume(folder).run.generation == GENERATIONS
         assert digest_parts(folder) == digest_parts(run.folder), folder.name
 

@@ -127,8 +127,9 @@ def test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_wri
     config = config_of("nsra_es")
 
     class Recording(MemoryStore):
-        def commit(self, generation, parts, history, evaluations, contents):
-            super().commit(generation, parts, history, evaluations, contents)
+        def commit(self, generations):
+            super().commit(generations)
+            [(generation, parts, history, *_)] = generations
             centres = {name for name in parts if name.startswith("centres/")}
             wanted = range(5) if generation == 0 else [history["centre"]]
             steps = [f"centres/{centre}/step" for centre in wanted]

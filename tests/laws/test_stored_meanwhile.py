@@ -1,11 +1,13 @@
 """A generation is stored and reported while the next one is computed, with the bits of one after the other."""
 
+import math
+import types
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from es_service.errors import EvaluationError
+from es_service.errors import EvaluationError, Interrupted
 from es_service.loop import driver
 from es_service.loop.budget import Clock
 from es_service.loop.contents import StatePolicies
@@ -22,17 +24,22 @@ GENERATIONS = 5
 
 
 class Beginning(Sharing):
-    """Computes what was begun when somebody waits for it, and notes both."""
+    """Computes what was begun when somebody waits for it, and notes both. The results of some generations take longer
+    than anybody waits who cannot wait for ever."""
 
-    def __init__(self, notes):
+    def __init__(self, notes, slow=()):
         super().__init__()
-        self.notes = notes
+        self.notes, self.slow = notes, slow
 
     def begin(self, work):
         generation = work[0][1].generation
         self.notes.append(("sent", generation))
 
-        def wait():
+        def wait(most_s):
+            if generation in self.slow and most_s < math.inf:
+                self.notes.append(("waited in vain for", generation))
+                driver.time.sleep(most_s)
+                return None
             self.notes.append(("waited for", generation))
             return self.evaluate(work)
 
@@ -44,9 +51,9 @@ class Noting(Remembering):
         super().__init__()
         self.notes = notes
 
-    def commit(self, generation, parts, history, evaluations, contents):
-        self.notes.append(("stored", generation))
-        super().commit(generation, parts, history, evaluations, contents)
+    def commit(self, generations):
+        self.notes.append(("stored", *(one.number for one in generations)))
+        super().commit(generations)
 
 
 def search_of(ask=lambda asked, generation: asked):
@@ -60,9 +67,10 @@ def search_of(ask=lambda asked, generation: asked):
     )
 
 
-def run(evaluator, notes, report=lambda row: None, ask=lambda asked, generation: asked):
+def run(evaluator, notes, report=lambda row: None, ask=lambda asked, generation: asked, interval_s=0.0):
     search, store = search_of(ask), Noting(notes)
-    return store, lambda: driver.drive(driver.run(search, store, None, report), evaluator)
+    session = driver.run(search, store, None, report, commit_interval_s=interval_s)
+    return store, lambda: driver.drive(session, evaluator)
 
 
 def test_a_generation_is_stored_after_the_next_was_sent_and_before_its_results_are_awaited():
@@ -146,3 +154,95 @@ def test_a_store_that_fails_is_not_asked_again():
     with pytest.raises(OSError, match="the disk is full"):
         compute()
     assert [note for note in notes if note[0] == "stored"] == [("stored", 0), ("stored", 1), ("stored", 2)]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The driver's clock, which stands still unless somebody sleeps or sets it forward: `now_s`."""
+    seconds = types.SimpleNamespace(now_s=100.0)
+
+    def sleep(s):
+        seconds.now_s += s
+
+    monkeypatch.setattr(driver, "time", types.SimpleNamespace(perf_counter=lambda: seconds.now_s, sleep=sleep))
+    return seconds
+
+
+def stored(notes):
+    return [note[1:] for note in notes if note[0] == "stored"]
+
+
+def test_generations_that_end_within_the_interval_are_stored_together(clock):
+    notes, reported = [], []
+
+    def ask(asked, generation):
+        clock.now_s += 1.0  # the time of a generation, but for the first
+        return asked
+
+    def report(row):
+        reported.append((row["generation"], store.generation))
+
+    store, compute = run(Beginning(notes), notes, report, ask, interval_s=1.5)
+    compute()
+    # The first of each ends at t, the second at t + 1; then one more is sent at t + 2.
+    assert stored(notes) == [(0, 1), (2, 3), (4, 5)]
+    assert notes.index(("stored", 0, 1)) == notes.index(("sent", 2)) + 1, "while the next one is computed"
+    assert reported == [(0, 1), (1, 1), (2, 3), (3, 3), (4, 5), (5, 5)], "after their commit"
+    one_by_one, compute = run(Sharing(), [])
+    compute()
+    for some, others in zip(store.after, one_by_one.after, strict=True):
+        assert some.keys() == others.keys()
+        for name, arrays in some.items():
+            for key, array in arrays.items():
+                np.testing.assert_array_equal(array, others[name][key])
+
+
+def test_a_generation_that_takes_long_leaves_none_before_it_unstored(clock):
+    notes = []
+    _, compute = run(Beginning(notes, slow=(3,)), notes, interval_s=1.5)
+    compute()
+    assert stored(notes) == [(0, 1, 2), (3, 4, 5)]
+    began = notes.index(("sent", 3))
+    assert notes[began + 1 : began + 4] == [("waited in vain for", 3), ("stored", 0, 1, 2), ("waited for", 3)]
+    assert clock.now_s == 101.5, "no longer than the interval"
+
+
+@pytest.mark.parametrize("evaluator", [Beginning, lambda notes: Sharing()])
+def test_an_error_or_a_stop_loses_no_generation_of_a_group(evaluator, clock):
+    notes = []
+    store, compute = run(
+        evaluator(notes), notes, ask=lambda asked, generation: asked if generation < 3 else (), interval_s=9.0
+    )
+    with pytest.raises(EvaluationError, match="generation 3"):
+        compute()
+    assert stored(notes) == [(0, 1, 2)]
+    notes.clear()
+    store, compute = run(
+        evaluator(notes), notes, lambda row: Stop("enough") if row["generation"] == 1 else None, interval_s=9.0
+    )
+    state, reason = compute()
+    assert stored(notes) == [(0, 1, 2, 3, 4, 5)]
+    assert (state.generation, store.generation, reason) == (5, 5, "enough")
+
+
+class Interrupting(Beginning):
+    """Is interrupted when somebody waits for the results of a generation."""
+
+    def begin(self, work):
+        wait = super().begin(work)
+
+        def interrupted(most_s):
+            if work[0][1].generation == 4:
+                raise Interrupted(15)
+            return wait(most_s)
+
+        return interrupted
+
+
+def test_an_interruption_stores_and_reports_what_has_ended(clock):
+    notes, reported = [], []
+    _, compute = run(Interrupting(notes), notes, lambda row: reported.append(row["generation"]), interval_s=9.0)
+    with pytest.raises(Interrupted):
+        compute()
+    assert stored(notes) == [(0, 1, 2, 3)]
+    assert reported == [0, 1, 2, 3]
