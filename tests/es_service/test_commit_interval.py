@@ -60,7 +60,7 @@ def test_what_may_not_repeat_is_stored_one_by_one(tmp_path):
     of_function = {key: value for key, value in CONFIG.items() if key != "policy"}
     of_function["task"] = {"environment": "function:tests.workers.functions:hill"}
     assert transactions(tmp_path / "function", of_function) == ONE_BY_ONE
-    asked = {"task": {"environment": "caller", "options": {"parameters": 3}}}
+    asked = {"task": {"environment": "caller", "options": {"parameters": 3}}, "map": {"enabled": False}}
     seen = []
     with ask_tell({key: CONFIG[key] for key in ("search", "budget")} | asked, tmp_path / "asked") as search:
         while (ask := search.ask()) is not None:
@@ -86,7 +86,8 @@ def test_the_same_is_certified_at_the_same_generation_with_any_interval(tmp_path
     target = float(api.run(config, tmp_path / "plain").run.history["best_fitness"].median())
     budget, found = config["budget"] | {"target_certified": target}, []
     for name, interval_s in (("alone", 0.0), ("together", 1.0)):
-        reached = transactions(tmp_path / name, config | {"budget": budget, "store": {"commit_interval_s": interval_s}})
+        settings = config | {"budget": budget, "store": {"commit_interval_s": interval_s}}
+        reached = transactions(tmp_path / name, settings, on_notice=[].append)
         certified = all_certifications(tmp_path / name)
         tries = [(one.generation, one.number, one.episodes.return_E.tolist()) for one in certified]
         found.append((tries, open_run(tmp_path / name).digest()))
