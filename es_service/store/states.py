@@ -248,7 +248,7 @@ class KeptStates:
                 for at, until in zip(rows, [*rows[1:], last + 1], strict=True)
                 if until >= last or self._is_kept(at, until, keep_every)
             ]
-            if before is None and (of_part.get(wanted[0]) or stored.get(wanted[0])) == GONE:
+            while before is None and wanted and of_part.get(wanted[0], stored.get(wanted[0])) == GONE:
                 del wanted[0]  # it removes nothing
             added |= {(part, at): of_part[at] for at in wanted if at in of_part}
             named |= {(part, at): names for at in wanted if (names := names_in(arrays.get((part, at)) or {}))}
