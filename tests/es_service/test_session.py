@@ -35,20 +35,21 @@ CONFIG = {
     "task": {"environment": "point_maze"},
     "search": {"algorithm": "es"},
     "budget": {"generations": 1},
-    "compute": {
-        "workers": 1,
-        "chunk_timeout_s": 5,
-        "compile_timeout_s": 8,
-        "first_chunk_timeout_s": 7,
-        "place_timeout_s": 15,
-        "no_worker_timeout_s": 20,
-    },
+    "compute": {"workers": 1},
 }
+DEADLINES = {
+    "compute.chunk_timeout_s": 5,
+    "compute.compile_timeout_s": 8,
+    "compute.first_chunk_timeout_s": 7,
+    "compute.place_timeout_s": 15,
+    "compute.no_worker_timeout_s": 20,
+}
+"""Too short for a run on a busy machine."""
 
 
 def messages_after(*events) -> list[str]:
     """Why workers are stopped, and the run, over all events; (seconds, event)."""
-    state, said = initial_state(dispatch_limits(load_config(CONFIG))), []
+    state, said = initial_state(dispatch_limits(load_config(CONFIG, DEADLINES))), []
     for now, event in events:
         said += [command.reason for command in handle(state, event, now) if isinstance(command, StopWorker)]
     return [*said, state.failed or ""]
@@ -75,9 +76,8 @@ def test_messages_of_deadlines_name_the_keys_that_set_them():
 
 
 def test_keys_that_messages_name_exist():
-    times = {
-        name for name in vars(dispatch_limits(load_config(CONFIG))) if re.search(r"_time(out|_limit)_s$|^time_", name)
-    }
+    limits = vars(dispatch_limits(load_config(CONFIG, DEADLINES)))
+    times = {name for name in limits if re.search(r"_time(out|_limit)_s$|^time_", name)}
     assert {"start_timeout_s", "chunk_timeout_s", "time_limit_s", "no_worker_timeout_s"} < times
     for limit in times:
         (section, key), *others = re.findall(r"(compute|task)\.(\w+)", key_of(limit))
@@ -119,7 +119,7 @@ def test_a_note_says_how_many_workers_start_where_not_all_have_work(tmp_path):
     assert [notice.partition(",")[0] for notice in notices] == ["compute.workers: 2 of 3 start"]
 
 
-def test_without_on_notice_a_notice_is_a_line_on_stderr(tmp_path, monkeypatch, capsys):
+def test_without_on_notice_a_notice_is_a_line_on_stderr(tmp_path, monkeypatch, capsys, one_process):
     monkeypatch.delattr("es_service.runs.session.print")  # which makes it an error in tests
     folder = api.run(SMALL | {"budget": {"generations": 1}}, tmp_path / "run").run.folder
     assert capsys.readouterr() == ("", "")
@@ -151,7 +151,9 @@ def test_the_largest_phase_of_a_generation_says_how_many_workers_have_work(setti
 
 
 @pytest.mark.parametrize("engine", ["inline", "ray"])
-def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_refused(engine, monkeypatch, tmp_path):
+def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_refused(
+    engine, monkeypatch, tmp_path, one_process
+):
     """Before anything is written: the way out of a refused resume is not refused again."""
     monkeypatch.setattr(counting, "cores", lambda: 2)
     assert worker_count(configured(8, engine=engine), 9) == 8

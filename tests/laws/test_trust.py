@@ -102,7 +102,7 @@ def test_a_module_that_may_import_pickle_does(module):
 
 
 @pytest.fixture
-def executed(tmp_path, monkeypatch):
+def executed(tmp_path, monkeypatch, one_process):
     """The file that importing the search of a user makes; the config of `run`, in the working folder, names it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
