@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import threading
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,8 +25,10 @@ CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
 
 def footprint() -> tuple[int, int, int]:
     """What this process holds: open file descriptors, threads, child processes."""
-    tasks = Path("/proc/self/task").iterdir()
-    children = sum(len((task / "children").read_text().split()) for task in tasks)
+    children = 0
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # a thread that was joined, which the kernel ends a little later than Python does
+            children += len((task / "children").read_text().split())
     return len(os.listdir("/proc/self/fd")), threading.active_count(), children
 
 
