@@ -251,7 +251,7 @@ POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.fixed_dictionaries(
         {},
