@@ -19,6 +19,7 @@ from tests.workers.steps import (
     brax_substeps,
     carried,
     environment_of,
+    kernel_of,
     of_many,
     pushed,
     resets_of,
@@ -54,7 +55,7 @@ def start(count: int) -> AntState:
 
 def step(state: AntState, action: np.ndarray) -> AntState:
     """Their next states."""
-    return steps_of("ant_trap")(state, action)[0]
+    return kernel_of("ant_trap")(state, action)[0]
 
 
 def actions(count: int, steps: int, seed: int = 0) -> np.ndarray:
@@ -78,7 +79,7 @@ def test_a_control_step_is_ten_of_brax_s():
         full = whole(state)
         for _ in range(10):
             full = brax_substeps()(full, action)
-        state = step(state, action)
+        state = steps_of("ant_trap")(state, action)[0]
         np.testing.assert_allclose(state.q, full.q, atol=1e-6)
         np.testing.assert_allclose(state.qd, full.qd, atol=2e-6 * np.abs(full.qd).max())
 
@@ -203,13 +204,13 @@ def test_landmarks_of_the_maze():
     np.testing.assert_allclose(observation[:, :2], (-25.0 - 2.5) / 37.5, rtol=1e-6)
     rewards = []
     for _ in range(400):  # ants without will, drawn along +x with ten times their weight: their legs give way
-        [(state, reward, *_)] = lying(steps_of("ant_maze"), drawn(state, 100.0), 1)
+        [(state, reward, *_)] = lying(kernel_of("ant_maze"), drawn(state, 100.0), 1)
         rewards.append(reward)
     np.testing.assert_allclose(rewards[-1], -25.75, atol=0.05)
     assert np.max(rewards) < -25.65, "no more than the tenth of a metre that a wall may give way"
     assert state.q[:, 0].max() < 10.0 - 0.5
     # Left to itself it is let go by the wall, and nothing scores above the landmark.
-    *_, (_, reward, *_) = lying(steps_of("ant_maze"), state, 60)
+    *_, (_, reward, *_) = lying(kernel_of("ant_maze"), state, 60)
     assert reward.max() <= -25.75
 
 
@@ -223,13 +224,13 @@ def test_the_trap_catches_and_falls_end_the_episode():
     state = first
     way = []
     for _ in range(300):
-        [(state, *_)] = lying(steps_of("ant_trap"), drawn(state, 9.81), 1)
+        [(state, *_)] = lying(kernel_of("ant_trap"), drawn(state, 9.81), 1)
         way.append(state.q[0, :3])
     assert 10.5 < way[-1][0] < 11.5
     assert np.max(way, axis=0)[2] < 1.5, "walls lift nothing"
 
     for height, ends in ((0.55, False), (2.0, True)):
-        [(_, _, done, *_)] = lying(steps_of("ant_trap"), carried(first, np.array([[0.0, 0.0, height - 0.55]])), 1)
+        [(_, _, done, *_)] = lying(kernel_of("ant_trap"), carried(first, np.array([[0.0, 0.0, height - 0.55]])), 1)
         assert bool(done[0]) == ends
     for xy, clipped in (((-3.0, 2.0), (0.0, 2.0)), ((40.0, -9.0), (30.0, -8.0)), ((5.0, 1.0), (5.0, 1.0))):
         away = carried(first, np.array([xy]) - first.q[:, :2])
@@ -239,7 +240,7 @@ def test_the_trap_catches_and_falls_end_the_episode():
 def test_reward_of_the_trap_by_hand():
     environment, state = environment_of("ant_trap"), start(1)
     action = np.linspace(-1.5, 1.0, 8, dtype=np.float32)
-    new, reward, *_ = steps_of("ant_trap")(state, action[None])
+    new, reward, *_ = kernel_of("ant_trap")(state, action[None])
     speed = (float(new.q[0, 0]) - float(state.q[0, 0])) / 0.05
     control = 0.5 * float((np.clip(action, -1, 1) ** 2).sum())
     forces = np.asarray(jax.vmap(contact_forces)(new))

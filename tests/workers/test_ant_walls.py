@@ -9,7 +9,7 @@ import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
-from tests.workers.steps import carried, of_many, pushed, resets_of, steps_of, system_of
+from tests.workers.steps import carried, kernel_of, of_many, pushed, resets_of, system_of
 from workers.environments import ant
 from workers.environments.ant import ant_viewer
 from workers.environments.ant_tasks import STEP_S
@@ -31,7 +31,7 @@ def watched(request):
     crossed one, torso position, whether all is finite; [N, STEPS].
     """
     name, walls, viewer = request.param, WALLS[request.param], ant_viewer(system_of(request.param))
-    step, begin = steps_of(name), resets_of(name)
+    step, begin = kernel_of(name), resets_of(name)
     look = of_many(
         lambda before_2, state: (depth(colliders(viewer.poses(state)), walls), crosses(before_2, state.q[:2], walls))
     )
