@@ -283,6 +283,7 @@ JUMANJI = {"Snake-v1": True, "Game2048-v1": True, "Minesweeper-v0": True, "Rubik
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore")  # Jumanji's own
 @pytest.mark.parametrize("name", JUMANJI)
 def test_the_first_steps_of_jumanji_are_its_own_and_simds(name: str) -> None:
     jumanji = pytest.importorskip("jumanji")
@@ -319,6 +320,7 @@ def test_the_first_steps_of_jumanji_are_its_own_and_simds(name: str) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore")  # Craftax's own
 def test_the_first_steps_of_craftax_are_its_own() -> None:
     module = pytest.importorskip("craftax.craftax_env")
     name = "Craftax-Classic-Symbolic-v1"

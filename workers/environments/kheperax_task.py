@@ -9,6 +9,7 @@ descriptor is where the robot is at the end.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -71,6 +72,7 @@ def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
         return jnp.linalg.norm(jnp.asarray(config.target_pos) - position(state))
 
     low, high = config.limits
+    least = -math.hypot(*np.subtract(high, low)) if has_target else -2.0 * config.action_scale**2
     described = {"position": (("x", "y"), tuple(zip(map(float, low), map(float, high), strict=True)))}
     plain = Suite(
         f"kheperax:{name}",
@@ -81,7 +83,7 @@ def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
         OPTIONS,
         measures=lambda state: {"position": position(state)},
         described=described,
-        facts={"walls": _walls(config.maze), "wall_clearance": float(config.robot.radius)},
+        facts={"walls": _walls(config.maze), "wall_clearance": float(config.robot.radius), "least_reward": least},
     )
     if not has_target:
         return plain
