@@ -23,7 +23,6 @@ from typing import Any
 
 STEPS, BATCH, TURNS = 100, 128, 5
 GUIDE = (
-    "craftax:Craftax-Classic-Symbolic-v1",
     "gymnax:Acrobot-v1",
     "gymnax:Breakout-MinAtar",
     "gymnax:CartPole-v1",
