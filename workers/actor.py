@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from es_service.protocol.machine import platform_info, platform_text
+from es_service.protocol.machine import cpu_seconds, platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
 from es_service.protocol.sent import LackingError, Received
@@ -93,7 +93,7 @@ class WorkerActor:
             with suppress(OSError):
                 remove_old_logs(Path(os.readlink("/proc/self/fd/1")))
         else:
-            self._before_s = earlier.cpu_s
+            self._before_s = self._seconds_so_far()
             for file in self._watched:
                 os.ftruncate(file, 0)
         if problem := why_refused(spec.sources, spec.task_code, spec.platform):
@@ -135,7 +135,6 @@ class WorkerActor:
         """
         assert self._made is not None, "run was called before build"
         assert self._reports is not None, "build makes them, too"
-        assert self._of_all is not None, "build makes them, too"
         with sendable(*self._task_code):
             try:
                 with self._turn:
@@ -143,8 +142,12 @@ class WorkerActor:
             except LackingError:
                 return pickle.dumps(None)
             self._reports.note(results := self._made.run_chunks(work))
-            seconds = self._of_all.cpu_s - self._before_s
+            seconds = self._seconds_so_far() - self._before_s
             return pickle.dumps((results, self._reports.report(), seconds), pickle.HIGHEST_PROTOCOL)
+
+    def _seconds_so_far(self) -> float:
+        """Seconds of processors that this process has used, and those of its cores."""
+        return cpu_seconds(()) if self._of_all is None else self._of_all.cpu_s
 
     def _unpacked(self, item: bytes, arrays: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""
