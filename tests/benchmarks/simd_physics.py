@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
-import os
 import re
 import statistics
 import subprocess
@@ -30,8 +29,8 @@ from unittest import mock
 
 import numpy as np
 
-from es_service.cli.bench import ANT_HIDDEN
-from es_service.protocol.process_environment import worker_environment
+from es_service.protocol.child import Child
+from es_service.protocol.process_environment import child_environment
 
 TASKS = ("ant_maze", "ant_trap", "point_maze", "brax:ant")
 OTHERS = ("brax:halfcheetah", "brax:hopper", "brax:walker2d", "brax:humanoid", "brax:reacher", "brax:pusher")
@@ -39,16 +38,20 @@ BATCHES = (8, 16, 64, 256)
 ROUNDS = 3
 
 
-def child(arguments: list[str], cache: str) -> dict:
-    """The JSON that a Python program prints, run as a worker would be, with a cache of its own."""
-    environment = worker_environment(os.environ) | {"XDG_CACHE_HOME": cache}
-    done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
+def facts(task: str, cache: str) -> dict:
+    """`facts_of` in a process like a worker's, with a cache of its own."""
+    command = [sys.executable, "-m", "tests.benchmarks.simd_physics", "--facts", task]
+    environment = child_environment() | {"XDG_CACHE_HOME": cache}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def rate(task: str, rollout: str, batch: int, cache: str) -> int:
-    arguments = {"task": task, "options": {}, "hidden": ANT_HIDDEN, "policy": False, "batch": batch, "seconds": 2.0}
-    return child(["-m", "workers.measure", json.dumps(arguments | {"rollout": rollout})], cache)["steps_per_second"]
+def rate(task: str, rollout: str, batch: int, cache: str, seconds: float = 2.0) -> int:
+    """Control steps a second of a worker, measured as by `es-service bench rollouts`."""
+    given = {"options": {}, "hidden": [], "policy": False, "batch": batch, "seconds": seconds, "rollout": rollout}
+    with Child("workers.measure:measurer", child_environment() | {"XDG_CACHE_HOME": cache}) as process:
+        process.call(task, given)
+        return process.call()["steps_per_second"]
 
 
 def step_of(task: str) -> tuple[Any, Any, Any]:
@@ -199,7 +202,7 @@ def peak() -> float:
 
 def measure(task: str) -> dict:
     with tempfile.TemporaryDirectory() as cache:
-        cold, warm = (child(["-m", "tests.benchmarks.simd_physics", "--facts", task], cache) for _ in range(2))
+        cold, warm = facts(task, cache), facts(task, cache)
         xla_rates = {batch: rate(task, "xla", batch, cache) for batch in BATCHES}
         batch = max(xla_rates, key=xla_rates.__getitem__)
         rounds = [(rate(task, "xla", batch, cache), rate(task, "simd", batch, cache)) for _ in range(ROUNDS)]
