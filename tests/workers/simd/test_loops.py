@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,20 @@ def check(function: Callable[..., Any]) -> None:
     wanted = jax.jit(jax.vmap(function))(X)
     for one, other in zip(jax.tree.leaves(kernel(X)), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=1e-5)
+
+
+def check_built_again(function: Callable[..., Any]) -> None:
+    """The operations and the bits are those of bodies that are always built again from what they carry."""
+    closed = jax.make_jaxpr(function)(X[0])
+    operations, results = [], []
+    for is_long in (loops._is_long, lambda graph, nodes: False):
+        with mock.patch.object(loops, "_is_long", is_long):
+            graph, _, outputs = trace_jaxpr(closed)
+        names = (graph.keys[node][0] for node in live(graph, outputs))
+        operations.append(collections.Counter(names))
+        results.append(np.array(evaluate(graph, outputs, np.ascontiguousarray(X[:8].T).view(np.uint32))).tobytes())
+    assert operations[0] == operations[1]
+    assert results[0] == results[1]
 
 
 def settle(x):
@@ -157,6 +172,45 @@ def test_an_inner_loop_that_starts_from_constants_belongs_to_the_outer_one() -> 
 
         return lax.fori_loop(0, 5, outer, x)
 
+    check(function)
+
+
+def test_the_body_of_a_loop_is_built_once_if_trips_read_nothing_that_is_not_carried() -> None:
+    """Twice at each level would be 32 times in the fifth."""
+
+    def nested(depth: int, x):
+        def trip(_, carry):
+            x, _ = carry
+            x = nested(depth - 1, x) if depth > 1 else settle(x)
+            return x, jnp.sin(derived(x))
+
+        x, seen = lax.fori_loop(0, 3, trip, (x, x[0]))
+        return x + 0.1 * seen
+
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(lambda x: nested(5, x))(X[0]))
+    assert len(graph.loops) == 5
+    assert [len(region.carried) for region in found(schedule(graph, outputs).region)] == [3] * 5
+    check_built_again(lambda x: nested(3, x))
+
+
+def test_a_loop_whose_unread_carry_begins_with_a_value_of_the_outer_one_stays_outside() -> None:
+    """What it gives is the same in all trips of the outer loop, and so it is computed once."""
+
+    def function(x):
+        def inner(_, carry):
+            z = settle(carry[0])
+            return z, jnp.sin(derived(z))
+
+        def outer(_, y):
+            z, size = lax.fori_loop(0, 4, inner, (x, y[0]))
+            return settle(y) + 0.1 * z + size
+
+        return lax.fori_loop(0, 5, outer, x)
+
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(X[0]))
+    first, second = (step for step in schedule(graph, outputs).region.steps if isinstance(step, Region))
+    assert (len(first.carried), len(second.carried)) == (3, 3)
+    check_built_again(function)
     check(function)
 
 
@@ -277,6 +331,7 @@ def check_random_loop(data: st.DataObject) -> None:
             start = run(start)  # so that some carries are derived
         return lax.fori_loop(0, 4, lambda _, c: run(c), start)
 
+    check_built_again(function)
     check(function)
 
 

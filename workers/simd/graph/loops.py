@@ -6,6 +6,8 @@ it is
 * *derived*, if its start is the same function of their starts (hash-consing shows this): it is computed from the other
   carries at the start of each trip instead of at its end;
 * *late*, if no trip reads it: it is computed once, from the results of the other carries.
+
+A body is built once to find this out, and a second time only if trips read a carry that the loop does not need.
 """
 
 from __future__ import annotations
@@ -97,26 +99,24 @@ def _operations(graph: Graph, nodes: Iterable[int]) -> int:
     return sum(bool(graph.arguments(node)) for node in nodes)
 
 
+def _is_long(graph: Graph, nodes: Iterable[int]) -> bool:
+    """Whether no loop with these nodes in its body becomes straight code, however often they are counted."""
+    return _operations(graph, nodes) > UNROLLED_OPERATIONS
+
+
 def _reduced(graph: Graph, loop: Loop, body: Body, outs: list[int], inside: set[int]) -> list[int]:
     """Results of a loop, closed with the carries that it needs."""
-    inits = loop.inits
-    kept, derived, late, firsts = _sort(graph, loop, outs, inside)
-    if len(kept) == len(inits):
-        return graph.close(loop, outs)
-
-    # Build the same body again, from the carries that are kept and the values derived from them.
-    reduced = graph.loop(loop.trips, [inits[k] for k in kept])
-    # Where several carries have the same end, use the start that `_sort` compared with.
-    starts = {outs[k]: carry for k, carry in zip(kept, reduced.carries, strict=True) if k in firsts}
-    carries = list(inits)
-    for k, carry in zip(kept, reduced.carries, strict=True):
-        carries[k] = carry
-    for k in derived:
-        carries[k] = substitute(graph, outs[k], starts)
-    for k in late:
-        carries[k] = inits[k]  # no trip reads it
-    new_outs = body(carries)
-    results = graph.close(reduced, [new_outs[k] for k in kept])
+    inits, used = loop.inits, live(graph, outs)
+    kept, derived, late, firsts = _sort(graph, loop, outs, inside, used)
+    dropped = {*range(len(inits))}.difference(kept)
+    if not dropped or (_is_long(graph, inside) and used.isdisjoint(loop.carries[k] for k in dropped)):
+        # Trips read nothing that is dropped, so the body would be the same if it were built again. To build it again
+        # would double the time of all loops inside, once for each loop around them.
+        loop.inits = [graph.const(graph.dtypes[init], 0) if k in dropped else init for k, init in enumerate(inits)]
+        all_ends = graph.close(loop, [loop.carries[k] if k in dropped else out for k, out in enumerate(outs)])
+        results = [all_ends[k] for k in kept]
+    else:
+        results = _closed_again(graph, loop, body, outs, kept, derived, firsts)
     all_results = list(inits)  # carries that never change
     for k, result in zip(kept, results, strict=True):
         all_results[k] = result
@@ -124,6 +124,23 @@ def _reduced(graph: Graph, loop: Loop, body: Body, outs: list[int], inside: set[
     for k in (*derived, *late):
         all_results[k] = substitute(graph, outs[k], ends)
     return all_results
+
+
+def _closed_again(
+    graph: Graph, loop: Loop, body: Body, outs: list[int], kept: list[int], derived: list[int], firsts: list[int]
+) -> list[int]:
+    """Results of the carries that are kept, of a loop whose body is built again from them and what is derived from
+    them; lists as of `_sort`."""
+    reduced = graph.loop(loop.trips, [loop.inits[k] for k in kept])
+    # Where several carries have the same end, use the start that `_sort` compared with.
+    starts = {outs[k]: carry for k, carry in zip(kept, reduced.carries, strict=True) if k in firsts}
+    carries = list(loop.inits)  # no trip reads those that are late
+    for k, carry in zip(kept, reduced.carries, strict=True):
+        carries[k] = carry
+    for k in derived:
+        carries[k] = substitute(graph, outs[k], starts)
+    ends = body(carries)
+    return graph.close(reduced, [ends[k] for k in kept])
 
 
 def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
@@ -134,16 +151,18 @@ def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
 
 
 def _sort(
-    graph: Graph, loop: Loop, outs: Sequence[int], inside: set[int]
+    graph: Graph, loop: Loop, outs: Sequence[int], inside: set[int], used: set[int]
 ) -> tuple[list[int], list[int], list[int], list[int]]:
     """Positions of carries as (kept, derived, late, firsts).
 
     A carry that is in none of the first three lists never changes. `firsts` has, for each end, the one carry whose
     start represents all carries with that end.
+
+    Args:
+        used: nodes on which the ends of a trip depend.
     """
     inits, carries = loop.inits, loop.carries
     candidates = [k for k, out in enumerate(outs) if out != carries[k]]
-    used = live(graph, outs)
     first_with: dict[int, int] = {}
     for k in sorted(candidates, key=lambda k: carries[k] not in used):  # carries that trips read come first
         first_with.setdefault(outs[k], k)
