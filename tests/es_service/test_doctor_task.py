@@ -68,7 +68,7 @@ def test_what_has_no_effect_is_noted_and_a_run_notes_it_once(tmp_path, one_proce
         "policy": {"hidden": []},
         "search": {"algorithm": "es", "pairs": 4, "evaluation_episodes": 1},
         "budget": {"generations": 1},
-        "compute": {"engine": "inline", "workers": 1, "rollout": "xla"},
+        "compute": {"engine": "inline", "workers": 1, "rollout": "simd"},
     }
     folder = api.run(settings, tmp_path / "run", on_notice=notices.append).run.folder
     assert notices == [note]

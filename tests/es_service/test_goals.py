@@ -13,6 +13,7 @@ from es_service.config.search import CandidatesConfig
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError
 from es_service.runs.goals import goal_configs, goals_reached
+from tests.helpers import workers_in_this_process
 from workers.environments.declared import wrong_values
 
 TASK = f"python:{__name__}:Line"
@@ -60,7 +61,8 @@ PARENT = {
 
 @pytest.fixture(scope="module")
 def parent(tmp_path_factory):
-    return run(load_config(PARENT), tmp_path_factory.mktemp("goals") / "parent").run
+    with workers_in_this_process():
+        return run(load_config(PARENT), tmp_path_factory.mktemp("goals") / "parent").run
 
 
 def test_each_goal_has_a_config_that_ranks_by_it(parent):
@@ -79,7 +81,7 @@ def test_each_goal_has_a_config_that_ranks_by_it(parent):
     assert "env_steps" not in goal_configs(parent.folder, ["left"], {"budget.generations": 3})[0].source["budget"]  # type: ignore[index]
 
 
-def test_unknown_goals_and_tasks_without_goals_are_refused(parent, tmp_path):
+def test_unknown_goals_and_tasks_without_goals_are_refused(parent, tmp_path, one_process):
     with pytest.raises(ConfigError, match="the goal rihgt is unknown; must be left or right; did you mean right"):
         goal_configs(parent.folder, ["rihgt"])
     maze = load_config({"task": {"environment": "point_maze"}, "search": {"algorithm": "es", "pairs": 16},

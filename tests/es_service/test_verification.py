@@ -25,7 +25,7 @@ CONFIG = {
     "policy": {"hidden": [4]},
     "search": {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "block_generations": 3, "emitters": 2},
     "budget": {"generations": 12},
-    "compute": {"engine": "inline", "workers": 1, "rollout": "xla", "chunk_pairs": 8, "gradient_block_pairs": 8},
+    "compute": {"engine": "inline", "workers": 1, "rollout": "simd", "chunk_pairs": 8, "gradient_block_pairs": 8},
     "store": {"keep_every": 4},
 }
 
