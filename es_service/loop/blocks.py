@@ -47,32 +47,27 @@ def tree_of(state: RunState) -> dict[str, Any]:
 
 
 def stored(state: RunState) -> dict[str, Arrays]:
-    return {name: arrays for name, arrays in changes(state, None).items() if arrays is not None}
+    return {name: arrays for name, arrays in changes(state, None)[0].items() if arrays is not None}
 
 
-def changes(state: RunState, before: RunState | None) -> dict[str, Arrays | None]:
-    """The blocks in which a state differs from the one before, None for those that it has not any more.
+def changes(state: RunState, before: RunState | None) -> tuple[dict[str, Arrays | None], frozenset[bytes]]:
+    """The blocks in which a state differs from the one before, None for those that it has not any more; and the names
+    that it has where it differs, which another row may have had.
 
     Contents are compared, so that no change is lost, however it was made; only the same object is taken for unchanged,
     since its arrays are read-only.
     """
     differing: dict[str, Arrays | None] = {}
-    for path, now, then in _pairs(state, before):
-        _compare(path, _arrays(now), _arrays(then), differing)
-    return differing
-
-
-def new_names(state: RunState, before: RunState | None) -> frozenset[bytes]:
-    """Names that a state has where it differs from the one before; another row may have had them."""
     found: set[bytes] = set()
-    for _, now, then in _pairs(state, before):
-        earlier = _arrays(then) or {}
-        for name, array in (_arrays(now) or {}).items():
+    for path, owner, owner_then in _pairs(tree_of(state), None if before is None else tree_of(before), ""):
+        now, then = _arrays(owner), _arrays(owner_then)
+        _compare(path, now, then, differing)
+        for name, array in (now or {}).items():
             if array.dtype == NAME:
-                now_N, then_N = array.reshape(-1), earlier.get(name, np.zeros(0, NAME)).reshape(-1)
+                now_N, then_N = array.reshape(-1), (then or {}).get(name, np.zeros(0, NAME)).reshape(-1)
                 both = min(now_N.size, then_N.size) if then_N.dtype == NAME else 0
                 found |= {*as_bytes(now_N[:both][now_N[:both] != then_N[:both]]), *as_bytes(now_N[both:])}
-    return frozenset(found) - {NO_NAME}
+    return differing, frozenset(found) - {NO_NAME}
 
 
 def names_of(blocks: Changes) -> frozenset[bytes]:
@@ -190,22 +185,19 @@ def _children(owner: Any) -> Mapping[str, Any]:
     return {field.name: getattr(owner, field.name) for field in _fields(type(owner))}
 
 
-def _is_node(value: object) -> bool:
-    return isinstance(value, Mapping) or is_dataclass(value)
+@cache
+def _is_node(kind: type) -> bool:
+    return issubclass(kind, Mapping) or is_dataclass(kind)
 
 
 def _is_group(value: object) -> bool:
     """Whether a value is a tuple of nodes."""
-    return isinstance(value, tuple) and bool(value) and _is_node(value[0])
+    return isinstance(value, tuple) and bool(value) and _is_node(type(value[0]))
 
 
-def _pairs(state: RunState, before: RunState | None) -> Iterator[tuple[str, Any, Any]]:
-    """Path and owners of each node that is not the same object in both states; None for one that is not there."""
-    return _pairs_below(tree_of(state), None if before is None else tree_of(before), "")
-
-
-def _pairs_below(now: Any, then: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """The same of the nodes of two trees but their roots. What is the same object has the same nodes below."""
+def _pairs(now: Any, then: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """Path and owners of each node of two trees, but their roots, that is not the same object in both; None for one
+    that is not there. What is the same object has the same nodes below."""
     children, earlier = (_children(owner) if owner is not None else {} for owner in (now, then))
     for name in [*children, *(earlier.keys() - children.keys())]:
         value, before = children.get(name), earlier.get(name)
@@ -218,14 +210,14 @@ def _pairs_below(now: Any, then: Any, path: str) -> Iterator[tuple[str, Any, Any
         for where, (node, node_then) in members.items():
             if node is not node_then:
                 yield where, node, node_then
-                yield from _pairs_below(node, node_then, where)
+                yield from _pairs(node, node_then, where)
 
 
 def _members(path: str, value: Any) -> list[tuple[str, Any]]:
     """The nodes that a child is: itself, the members of a group, or none."""
     if _is_group(value):
         return [(f"{path}/{number}", member) for number, member in enumerate(value)]
-    return [(path, value)] if _is_node(value) else []
+    return [(path, value)] if _is_node(type(value)) else []
 
 
 def _arrays(owner: Any) -> dict[str, np.ndarray] | None:
@@ -236,7 +228,7 @@ def _arrays(owner: Any) -> dict[str, np.ndarray] | None:
     return {
         name: np.asarray(value, _NUMBERS.get(types_of.get(name)))
         for name, value in _children(owner).items()
-        if value is not None and not _is_node(value) and not _is_group(value)
+        if value is not None and not _is_node(type(value)) and not _is_group(value)
     }
 
 

@@ -195,6 +195,9 @@ class StatePolicies:
     def add(self, contents: Mapping[bytes, Arrays], origins: Mapping[bytes, Origin]) -> None:
         """Take in those of a new generation, and how they were made. Those of the one before are stored."""
         self._newest = contents
+        for name, content in contents.items():
+            self._kept.add(name, content)
+        self._kept.forget_oldest(self._most_bytes)
         self._origins |= origins
         for name in [*islice(self._origins, max(0, len(self._origins) - MOST_ORIGINS))]:
             del self._origins[name]

@@ -21,7 +21,6 @@ import numpy as np
 
 from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
-from es_service.config.workload import policy_spec
 from es_service.logs import in_generation
 from es_service.loop import budget as budgets
 from es_service.loop.blocks import state_of
@@ -255,10 +254,10 @@ def propose(
     """What the next generation asks for: (the state in which centres have restarted from elites, the cells of these
     elites by index of the centre, the asks)."""
     algorithm, begun, number = search.algorithm, state.search, state.generation + 1
-    spec, size = policy_spec(search.config, search.task), begun.centres[0].centre_D.size
+    size = begun.centres[0].centre_D.size
     start_cells = require_start_cells(algorithm.start_cells(begun, number), begun, number)
     for index, cell in start_cells.items():
-        begun = algorithm.restart(begun, index, cell, policies.policy(_policy_of(begun, cell), spec))
+        begun = algorithm.restart(begun, index, cell, policies.policy(_policy_of(begun, cell), search.spec))
         require_state(begun, "restart", number, index, size)
     asked: Any = policies.completed(algorithm.ask(begun, number), number)
     require_asks(asked, begun, search.config.compute.chunk_pairs, search.task.observation_size, number)
@@ -278,7 +277,7 @@ def _initial(search: Search, state: RunState, clock: Clock) -> Requests[tuple[Ce
     results = yield from evaluate_centres(centres, config.search.evaluation_episodes, resets="by_chunk")
     clock.lap("seconds_evaluation")
     require_some_finite(results, config.task.environment, allow_infeasible=config.search.allow_infeasible)
-    return told_of_initial(centres, results, config, state.search.weight.value, policy_spec(config, search.task))
+    return told_of_initial(centres, results, config, state.search.weight.value, search.spec)
 
 
 def _asked(
@@ -322,7 +321,7 @@ def _asked(
         seed=config.seed,
         centres=len(begun.centres),
         fitness_weight=begun.weight.value,
-        spec=policy_spec(config, search.task),
+        spec=search.spec,
     )
     return Members(valid, observed, infeasible, 2 * sum(pairs)), stepped, told
 

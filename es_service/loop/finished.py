@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.loop.blocks import changes, new_names
+from es_service.loop.blocks import changes
 from es_service.loop.budget import MOST_DURATIONS, Clock, durations
 from es_service.loop.checks import require_known, require_storable
 from es_service.loop.contents import Named
@@ -56,10 +57,6 @@ class Finished:
     before: RunState
     state: RunState
     """State after it."""
-    parts: Changes
-    """Blocks of arrays that it has changed."""
-    contents: Contents
-    """The policies and traces that it names and that are new."""
     start_cells: Mapping[int, int]
     """Index of a centre -> cell of the elite from which it has restarted."""
     members: Members
@@ -74,6 +71,24 @@ class Finished:
     columns: HistoryRow
     """Further columns of the history: corrected values, faults, and how its seconds were spent."""
     seconds: float
+
+    @cached_property
+    def _changed(self) -> tuple[Changes, Contents]:
+        stored = self.before if self.before.generation >= 0 else None
+        parts, names = changes(self.state, stored)
+        contents = {name: content for name, content in self.named.contents.items() if name in names}
+        require_known(names.difference(contents), stored, self.told.generation)
+        return parts, contents
+
+    @property
+    def parts(self) -> Changes:
+        """Blocks of arrays that it has changed; they are found when it is stored, while the next one is computed."""
+        return self._changed[0]
+
+    @property
+    def contents(self) -> Contents:
+        """The policies and traces that it names and that are new."""
+        return self._changed[1]
 
     @property
     def failures(self) -> Sequence[str]:
@@ -118,19 +133,14 @@ def finish(
         episodes=before.episodes + trained + results.fitness.size + correction.episodes,
         wall_clock_s=clock.total(),
     )
-    stored = before if before.generation >= 0 else None
-    require_storable(state, stored)
-    parts = changes(state, stored)
-    names = new_names(state, stored)
-    contents = {name: content for name, content in named.contents.items() if name in names}
-    require_known(names.difference(contents), stored, generation)
+    require_storable(state, before if before.generation >= 0 else None)
     clock.lap("seconds_driver")
     seconds, laps = clock.finish_generation()
     recent = (*before.durations, *durations([{"generation": generation, **laps}]))[-MOST_DURATIONS:]
     state = replace(state, durations=recent)
     columns = {**correction.columns, **faults, **laps}
     computed = start_cells, members, told, named, novelty_N, cell_N
-    return Finished(before, state, parts, contents, *computed, columns, seconds)
+    return Finished(before, state, *computed, columns, seconds)
 
 
 def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -14,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
+from es_service.config.workload import policy_spec
 from es_service.errors import ConfigError
 from es_service.loop.history import HistoryRow, Table
 from es_service.protocol.content import NAME, Arrays, Contents
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
+from es_service.protocol.policy_spec import PolicySpec
 from es_service.search.algorithms.base import Algorithm, CentreState, SearchState
 
 Changes = Mapping[str, Arrays | None]
@@ -208,3 +211,7 @@ class Search:
     statistics: Callable[[], Sequence[tuple[FloatArray, FloatArray]]] = lambda: ()
     """Returns mean and standard deviation of observations, [O] each, that each initial centre keeps as its own; none if
     they all use those of the whole run."""
+
+    @cached_property
+    def spec(self) -> PolicySpec:
+        return policy_spec(self.config, self.task)

@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -36,9 +37,14 @@ def name_of(arrays: Arrays) -> bytes:
     for name in sorted(arrays):
         little = np.asarray(arrays[name])
         little = np.ascontiguousarray(little, little.dtype.newbyteorder("<")).reshape(little.shape)
-        total.update(json.dumps([name, little.dtype.str, list(little.shape)]).encode() + b"\n")
+        total.update(_heading(name, little.dtype.str, little.shape))
         total.update(little.tobytes() if little.dtype == NAME or not little.size else little.data)
     return total.digest()
+
+
+@lru_cache
+def _heading(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
+    return json.dumps([name, dtype, list(shape)]).encode() + b"\n"
 
 
 def names(values: Iterable[bytes]) -> NDArray[Any]:
@@ -71,13 +77,17 @@ class Policy:
     @property
     def content(self) -> dict[str, NDArray[Any]]:
         """Its arrays as they are stored, and named."""
-        text = json.dumps(asdict(self.spec), sort_keys=True).encode()
-        return {name: getattr(self, name) for name in OF_POLICY} | {"spec": np.frombuffer(text, np.uint8)}
+        return {name: getattr(self, name) for name in OF_POLICY} | {"spec": _text_of(self.spec)}
 
     @property
     def name(self) -> bytes:
         """Its name; two policies are the same if their names are equal."""
         return name_of(self.content)
+
+
+@cache
+def _text_of(spec: PolicySpec) -> NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(asdict(spec), sort_keys=True).encode(), np.uint8)
 
 
 OF_POLICY = ("parameters_D", "observation_mean_O", "observation_std_O")

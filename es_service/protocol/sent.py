@@ -10,14 +10,14 @@ again.
 
 from __future__ import annotations
 
-import io
 import pickle
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.content import Cache
-from es_service.protocol.messages import FloatArray, Work, recipes_in
+from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
 from es_service.protocol.policies import Origin, Policies, Recipes, parent_name, recipes_again
 
 Value = TypeVar("Value")
@@ -82,17 +82,18 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
     """
     needed: dict[bytes, FloatArray] = {}
     origins_of: dict[bytes, Mapping[bytes, Origin]] = {}
-    names: dict[int, bytes] = {}
+    written: dict[int, Subject] = {}
     for subject in {id(subject): subject for subject, _ in work}.values():
+        written[id(subject)] = subject
         if (recipes := recipes_in(subject)) is not None:
             named = dict(zip(recipes.names, recipes.parents, strict=True))
+            needed |= named
             origins_of |= dict.fromkeys(named, recipes.origins)
-        else:
-            array: Any = subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
+            written[id(subject)] = _with(subject, replace(recipes, parents=()))
+        elif (array := _parameters(subject)).nbytes >= LEAST_BYTES:
             shape = b"" if array.ndim == 1 else repr(array.shape).encode()  # [1, D] has the bits of [D]
-            named = {parent_name(array) + shape: array} if array.nbytes >= LEAST_BYTES else {}
-        needed |= named
-        names |= {id(array): name for name, array in named.items()}
+            needed[name := parent_name(array) + shape] = array
+            written[id(subject)] = _with(subject, name)
     arrays: dict[bytes, FloatArray] = {}
     origins: dict[bytes, Origin] = {}
     for name, array in needed.items():
@@ -106,9 +107,17 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
         for each in [name] if steps is None else steps:
             memory.add(each, array.nbytes)
     memory.needed(needed, origins_of)
-    written = io.BytesIO()
-    _Naming(written, names).dump(list(work))
-    return Parcel(arrays, origins, written.getvalue())
+    pickled = pickle.dumps([(written[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
+    return Parcel(arrays, origins, pickled)
+
+
+def _parameters(subject: Subject) -> Any:
+    return subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
+
+
+def _with(subject: Subject, parameters: Any) -> Subject:
+    """A subject with other parameters: a name stands for them in a message, and for parents those of their recipes."""
+    return replace(subject, **{"parameters_N_D" if isinstance(subject, Policies) else "parameters_D": parameters})
 
 
 def _steps(name: bytes, memory: Memory[int], origins: Mapping[bytes, Origin]) -> dict[bytes, Origin] | None:
@@ -126,31 +135,6 @@ def _steps(name: bytes, memory: Memory[int], origins: Mapping[bytes, Origin]) ->
         steps[policy_name] = origin
         waiting += origin.x, origin.y
     return dict(reversed(steps.items()))
-
-
-class _Naming(pickle.Pickler):
-    """Writes names in the place of arrays."""
-
-    def __init__(self, file: io.BytesIO, names: Mapping[int, bytes]) -> None:
-        """Begin to write; `names`: name of an array by its `id`."""
-        super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self._names = names
-
-    def persistent_id(self, obj: object) -> bytes | None:
-        return self._names.get(id(obj))
-
-
-class _Reading(pickle.Unpickler):
-    """Reads arrays in the place of their names, or None for one that is lacking."""
-
-    def __init__(self, work: bytes, memory: Memory[FloatArray]) -> None:
-        super().__init__(io.BytesIO(work))
-        self._memory = memory
-        self.names: dict[bytes, None] = {}
-
-    def persistent_load(self, pid: bytes) -> FloatArray | None:
-        self.names[pid] = None
-        return self._memory.get(pid)
 
 
 class Received:
@@ -174,14 +158,24 @@ class Received:
     def work(self, origins: Mapping[bytes, Origin], work: bytes) -> list[Work]:
         """A work item. Raises LackingError."""
         self._make(origins)
-        reading = _Reading(work, self.memory)
-        item: list[Work] = reading.load()
-        if any(name not in self.memory for name in reading.names):
-            raise LackingError
-        of_recipes = (recipes_in(subject) for subject, _ in item)
-        parents = {name for recipes in of_recipes if recipes is not None for name in recipes.names}
-        self.memory.needed(reading.names, parents)
-        return item
+        item: list[Work] = pickle.loads(work)
+        read: dict[int, Subject] = {}
+        names: dict[bytes, None] = {}
+        parents: set[bytes] = set()
+        try:
+            for subject in {id(subject): subject for subject, _ in item}.values():
+                read[id(subject)] = subject
+                if (recipes := recipes_in(subject)) is not None:
+                    read[id(subject)] = _with(subject, recipes.complete(self.memory, {}))
+                    names |= dict.fromkeys(recipes.names)
+                    parents.update(recipes.names)
+                elif isinstance(name := _parameters(subject), bytes):
+                    read[id(subject)] = _with(subject, self.memory[name])
+                    names[name] = None
+        except KeyError as error:
+            raise LackingError from error
+        self.memory.needed(names, parents)
+        return [(read[id(subject)], chunk) for subject, chunk in item]
 
     def _make(self, origins: Mapping[bytes, Origin]) -> None:
         """Make policies again, those of one rule together as soon as their parents are there, since a call takes longer

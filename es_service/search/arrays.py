@@ -103,8 +103,9 @@ def same_rows(now: np.ndarray, then: np.ndarray) -> NDArray[np.bool_]:
     if _address(now) == _address(then) and now.strides == then.strides:  # an archive that has grown
         return np.ones(count, bool)
     row_bytes = now.dtype.itemsize * math.prod(now.shape[1:])
-    first, second = (np.frombuffer(array[:count].tobytes(), np.uint8) for array in (now, then))
-    return (first.reshape(count, row_bytes) == second.reshape(count, row_bytes)).all(axis=1)
+    word = np.dtype(f"u{math.gcd(row_bytes, 8)}")
+    first, second = (np.frombuffer(array[:count].tobytes(), word) for array in (now, then))
+    return (first == second).reshape(count, row_bytes // word.itemsize).all(axis=1)
 
 
 def _address(array: np.ndarray) -> int:

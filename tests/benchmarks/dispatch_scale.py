@@ -1,21 +1,28 @@
 """What do many work items and many workers cost the driver?
 
     python -m tests.benchmarks.dispatch_scale
+    python -m tests.benchmarks.dispatch_scale --transport       # what a message between two processes costs
 
 Real scheduler and engine; the transport answers at once, in this process, so that what is measured is the driver alone.
 Each item is one chunk. A generation is one call of `Engine.evaluate`; the first one finds the workers' first items, so
 the seconds are the median of those after it. The scheduler alone is given the answers of a generation one by one, and
 its microseconds are per answer; a submitted item is assigned at once if there is a worker for it. One JSON row each.
+With --transport, another process sends back what it is sent: over a socket, as the engine inline does, and through
+shared memory, for which both sides spin. Microseconds of a round trip by the clock, and of the processor on each side.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import mmap
+import os
+import signal
 import statistics
+import sys
 import time
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,11 +31,14 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Assign, Compiled, Limits, Result, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
+from es_service.protocol.child import socket_pair
 from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, with_subject
+from es_service.protocol.wire import framed, receive
 
 SIZES = ((10, 10), (100, 100), (1000, 1000), (10_000, 10_000), (10_000, 100))
 """(items, workers)."""
 GENERATIONS = 6
+ROUND_TRIPS = 3000
 _RESULT = GradientResult(np.zeros(0, np.float32))
 
 
@@ -128,7 +138,59 @@ def measure(items: int, workers: int) -> dict[str, Any]:
     }
 
 
+def transport_us(size: int) -> dict[str, Any]:
+    """Round trips of a message of this size over a socket."""
+    ours, theirs = socket_pair()
+
+    def there() -> None:
+        while True:
+            theirs.sendall(framed(receive(theirs)))
+
+    def round_trip(number: int) -> None:
+        ours.sendall(framed(message))
+        receive(ours)
+
+    message = bytes(size)
+    return {"bytes": size, **_measured(there, round_trip)}
+
+
+def spinning_us() -> dict[str, Any]:
+    """Round trips of a number through shared memory."""
+    memory = np.frombuffer(mmap.mmap(-1, 4096), np.int64)
+
+    def there() -> None:
+        seen = 0
+        while True:
+            while memory[0] == seen:
+                pass
+            seen = memory[64] = memory[0]
+
+    def round_trip(number: int) -> None:
+        memory[0] = number
+        while memory[64] != number:
+            pass
+
+    return {"spinning": True, **_measured(there, round_trip)}
+
+
+def _measured(there: Callable[[], None], round_trip: Callable[[int], None]) -> dict[str, float]:
+    if not (child := os.fork()):
+        there()
+    started, used = time.perf_counter(), time.process_time()
+    for number in range(1, ROUND_TRIPS + 1):
+        round_trip(number)
+    clock_s, here_s = time.perf_counter() - started, time.process_time() - used
+    os.kill(child, signal.SIGKILL)
+    usage = os.wait4(child, 0)[2]
+    seconds = {"clock": clock_s, "processor_here": here_s, "processor_there": usage.ru_utime + usage.ru_stime}
+    return {f"{name}_us": round(value / ROUND_TRIPS * 1e6, 1) for name, value in seconds.items()}
+
+
 def main() -> None:
+    if "--transport" in sys.argv[1:]:
+        for row in (*map(transport_us, (200, 4_000, 40_000)), spinning_us()):
+            print(json.dumps(row), flush=True)
+        return
     for items, workers in SIZES:
         print(json.dumps(measure(items, workers)), flush=True)
 

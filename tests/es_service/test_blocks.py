@@ -33,7 +33,7 @@ def rows(count):
 
 def found(now, then):
     """Blocks of a search's own values that differ, with the number of rows of x; None for those that are gone."""
-    differing = changes(state(now), state(then)).items()
+    differing = changes(state(now), state(then))[0].items()
     return {name: None if block is None else len(block["x"]) for name, block in differing if name.startswith("extra/")}
 
 
@@ -62,15 +62,15 @@ def test_what_is_not_all_of_the_same_rows_is_stored_whole():
 
 @pytest.mark.parametrize("other", [np.array(-0.0), np.array(0.0, np.float32), np.zeros(1), np.array(0)])
 def test_bits_types_and_shapes_count(other):
-    assert "extra" not in changes(state({"a": np.array(0.0)}), state({"a": np.array(0.0)}))
-    differing = changes(state({"a": other}), state({"a": np.array(0.0)}))
+    assert "extra" not in changes(state({"a": np.array(0.0)}), state({"a": np.array(0.0)}))[0]
+    differing, _ = changes(state({"a": other}), state({"a": np.array(0.0)}))
     assert [name for name, block in differing.items() if block and "a" in block] == [
         "extra#000000" if other.ndim else "extra"
     ]
 
 
 def test_a_name_that_changes_its_kind_leaves_nothing_behind():
-    differing = changes(state({"a": {"y": np.array(1)}}), state(rows(ROWS + 1)))
+    differing, _ = changes(state({"a": {"y": np.array(1)}}), state(rows(ROWS + 1)))
     assert {name for name, block in differing.items() if block is None} == {"extra/a#000000", "extra/a#000001"}
     assert joined({name: block for name, block in differing.items() if block}).keys() == {"extra/a"}
 
@@ -84,7 +84,7 @@ def test_a_state_is_what_its_blocks_say():
     first = replace(first, own_mean_O=np.ones(2, np.float32), own_std_O=np.zeros(2, np.float32), entry=3)
     before = replace(before, search=replace(before.search, centres=(first, second)))
     again = state_of(stored(before), 0, 0.0)
-    assert changes(again, before) == {}
+    assert changes(again, before) == ({}, frozenset())
     assert (again.env_steps, again.search.weight, again.search.centres[0].entry) == (2**40, before.search.weight, 3)
     assert again.search.centres[1].own_mean_O is None
     assert again.search.map.geometry.bounds == geometry.bounds

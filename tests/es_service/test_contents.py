@@ -71,6 +71,12 @@ def test_those_of_the_newest_generation_need_not_be_stored_yet(store):
     contents.add({}, {})
     assert values(contents, 9) == [9]
     assert store.read == [0]
+    contents = StatePolicies(store.content, most_bytes=3 * KILOBYTE)
+    contents.add({bytes([number]): content(number) for number in range(5)}, {})
+    assert values(contents, 0, 1, 2, 3, 4) == [0, 1, 2, 3, 4]
+    contents.add({}, {})
+    assert values(contents, 3, 4) == [3, 4]
+    assert store.read == [0]
     with pytest.raises(KeyError):
         values(contents, 8)
 

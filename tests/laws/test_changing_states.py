@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.loop.blocks import changes, names_of, new_names, state_of, stored
+from es_service.loop.blocks import changes, names_of, state_of, stored
 from es_service.loop.state import Best, Generation, RunState
 from es_service.protocol.content import name_of, names
 from es_service.protocol.messages import Moments
@@ -227,7 +227,7 @@ def commit(store, states, before):
 
     def stored_of(now, then):
         row, evaluations = history_row(now.generation), evaluated_table(now.generation)
-        return Generation(now.generation, changes(now, then), row, evaluations, POLICIES)
+        return Generation(now.generation, changes(now, then)[0], row, evaluations, POLICIES)
 
     store.commit([stored_of(now, then) for then, now in pairwise([before, *states])])
 
@@ -308,7 +308,7 @@ def test_the_same_is_written_after_a_resume_and_what_has_not_changed_is_not(cour
     states = every_state(seed, course)
     for before, state in pairwise(states):
         resumed = state_of(reference(before), before.generation, 0.0)
-        straight, after_resume = (changes(state, then) for then in (before, resumed))
+        straight, after_resume = (changes(state, then)[0] for then in (before, resumed))
         assert straight.keys() == after_resume.keys()
         then, now = reference(before), reference(state)
         differing = {name for name in now if name not in then or not same(now[name], then[name])}
@@ -322,7 +322,8 @@ def test_the_same_is_written_after_a_resume_and_what_has_not_changed_is_not(cour
 def test_new_names_are_those_that_the_state_before_has_not_and_perhaps_others_of_what_differs(course, seed):
     for before, state in pairwise([None, *every_state(seed, course)]):
         had = frozenset() if before is None else names_of(stored(before))
-        assert names_of(stored(state)) - had <= new_names(state, before) <= names_of(changes(state, before))
+        blocks, new_names = changes(state, before)
+        assert names_of(stored(state)) - had <= new_names <= names_of(blocks)
 
 
 def same(now, then):
