@@ -21,6 +21,7 @@ import numpy as np
 
 from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
+from es_service.errors import StoreError
 from es_service.logs import in_generation
 from es_service.loop import budget as budgets
 from es_service.loop.blocks import state_of
@@ -111,14 +112,22 @@ def run(
         for one in together:
             if one.failures:
                 failed(one.failures)
-        taken = [
-            Generation(one.state.generation, one.parts, *rows(search, one, reachable), one.contents) for one in together
-        ]
+        taken: list[Generation] = []
+        wrong = None
+        try:
+            for one in together:
+                found = rows(search, one, reachable)
+                taken.append(Generation(one.state.generation, one.parts, *found, one.contents))
+        except StoreError as error:  # nobody has a policy that it names; those before it are stored
+            wrong = error
         since = clock.meanwhile("seconds_driver", since)
-        store.commit(taken)
+        if taken:
+            store.commit(taken)
         since = clock.meanwhile("seconds_store", since)
         answers = [report(one.history) for one in taken]
         clock.meanwhile("seconds_driver", since)
+        if wrong is not None:
+            raise wrong
         return next((answer.reason for answer in answers if isinstance(answer, Stop)), None)
 
     policies = StatePolicies(content)
