@@ -111,6 +111,7 @@ def run(
         waiting.clear()
         for one in together:
             if one.failures:
+                in_generation(one.state.generation)
                 failed(one.failures)
         taken: list[Generation] = []
         wrong = None
@@ -124,7 +125,11 @@ def run(
         if taken:
             store.commit(taken)
         since = clock.meanwhile("seconds_store", since)
-        answers = [report(one.history) for one in taken]
+        answers: list[object] = []
+        for one in taken:
+            in_generation(one.number)
+            answers.append(report(one.history))
+        in_generation(state.generation + 1)
         clock.meanwhile("seconds_driver", since)
         if wrong is not None:
             raise wrong

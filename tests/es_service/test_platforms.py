@@ -29,6 +29,7 @@ CONFIG = {
     "search": {"algorithm": "es", "pairs": 16},
     "budget": {"generations": 4},
     "compute": {"engine": "inline", "workers": 1},
+    "store": {"commit_interval_s": 0},  # a worker that joins counts for all generations of a transaction
 }
 
 

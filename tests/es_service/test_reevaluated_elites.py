@@ -31,7 +31,7 @@ CONFIG = {
     },
     "map": {"enabled": True, "cells": [60, 60]},
     "budget": {"generations": GENERATIONS},
-    "store": {"keep_every": 1},
+    "store": {"keep_every": 1, "commit_interval_s": 0},
     "compute": {"engine": "inline", "workers": 1},
 }
 

@@ -142,7 +142,7 @@ def test_of_a_certification_that_was_killed_there_is_all_or_nothing(tmp_path):
     create(tmp_path / "whole", generations=2).close()
     for hook in hooks:
         shutil.copytree(tmp_path / "whole", tmp_path / hook)
-    assert killed(tmp_path, [("certify", hook, hook, 1) for hook in hooks]) == {*hooks}
+    assert killed(tmp_path, [("certify", hook, hook, 1, 1) for hook in hooks]) == {*hooks}
     for number, hook in enumerate(hooks):
         is_stored = number >= 2
         with RunStore.open(tmp_path / hook) as run:
