@@ -110,8 +110,8 @@ def run(
         since, together = clock.now(), [*waiting]
         waiting.clear()
         for one in together:
+            in_generation(one.state.generation)
             if one.failures:
-                in_generation(one.state.generation)
                 failed(one.failures)
         taken: list[Generation] = []
         wrong = None

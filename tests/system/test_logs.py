@@ -11,7 +11,7 @@ from es_service import api
 from tests.system.command_line import COMPILES, command
 from tests.system.session import SMALL
 
-SHORT = SMALL | {"budget": {"generations": 2}}
+SHORT = SMALL | {"budget": {"generations": 2}, "store": {"commit_interval_s": 0}}
 
 
 def test_every_record_of_a_run_carries_its_id_and_its_generation(tmp_path, caplog):
