@@ -129,7 +129,7 @@ def run(
         for one in taken:
             in_generation(one.number)
             answers.append(report(one.history))
-        in_generation(state.generation + 1)
+        in_generation(together[-1].state.generation + 1)
         clock.meanwhile("seconds_driver", since)
         if wrong is not None:
             raise wrong
