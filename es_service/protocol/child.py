@@ -32,7 +32,7 @@ from typing import IO, Any, NamedTuple, Self
 
 from es_service.protocol.errors import ForkedError
 from es_service.protocol.machine import process_cpu_s
-from es_service.protocol.process_environment import child_environment, newest_output
+from es_service.protocol.process_environment import child_environment, newest_lines, newest_output
 from es_service.protocol.user_code import RaisedError, raised
 from es_service.protocol.wire import BUFFER_BYTES, framed, receive
 
@@ -289,8 +289,7 @@ def _end(
     if log is not None:
         newest_output().forget(watched)
         with log:
-            log.seek(max(0, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-            last_words = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
+            last_words = newest_lines(log.fileno(), LAST_WORDS_BYTES).decode(errors="replace").strip()
     return End(f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}", last_words, cpu_s)
 
 

@@ -186,10 +186,14 @@ def _of(process: int) -> NewestOutput:
 def cut(descriptor: int, most_bytes: int) -> int:
     """Take away the beginning of a file that others append to, up to the end of a line; returns how many bytes are
     left."""
-    first = max(0, os.fstat(descriptor).st_size - most_bytes)
-    newest = os.pread(descriptor, most_bytes, first)
-    if first:
-        newest = newest[newest.find(b"\n") + 1 :]  # all of it, if it has no end of a line
+    newest = newest_lines(descriptor, most_bytes)
     os.ftruncate(descriptor, 0)
     os.write(descriptor, newest)
     return len(newest)
+
+
+def newest_lines(descriptor: int, most_bytes: int) -> bytes:
+    """The end of a file, at most so many bytes: from the beginning of a line on, if there is one among them."""
+    first = max(0, os.fstat(descriptor).st_size - most_bytes)
+    newest = os.pread(descriptor, most_bytes, first)
+    return newest[newest.find(b"\n") + 1 :] or newest if first else newest

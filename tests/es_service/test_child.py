@@ -77,6 +77,7 @@ def test_of_a_child_that_printed_a_lot_only_the_end_is_read():
     child._log.truncate(2**40)
     child._log.seek(0, os.SEEK_END)
     child._log.write("ä".encode() * 1500 + b" the last words\n")
+    child._log.flush()
     how, last_words, _ = child.end()
     assert how == "signal SIGKILL"
     assert last_words.endswith("ää the last words")

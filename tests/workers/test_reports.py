@@ -14,7 +14,7 @@ import pytest
 from es_service.protocol.errors import TaskError
 from es_service.protocol.machine import memory_of_tree_bytes
 from es_service.protocol.messages import EpisodesResult, Moments, Report
-from es_service.protocol.process_environment import cut
+from es_service.protocol.process_environment import cut, newest_lines
 from es_service.runs.engine import reader_of_reports
 from es_service.store.lock import MOST_LINE, MOST_LINES, acquire_lock, last_output, lock_holder
 from tests.helpers import spec
@@ -49,6 +49,8 @@ def test_of_a_file_the_newest_lines_are_read_once_also_after_its_beginning_was_c
         cut(file.fileno(), 100)
         file.write(b"after\n")
         assert tail.new().endswith("not end\nafter")
+        assert newest_lines(file.fileno(), 9) == b"after\n"
+        assert newest_lines(file.fileno(), 6) == b"after\n"
         tail.close()
         file.write(b"late\n")
         assert tail.new() == ""
