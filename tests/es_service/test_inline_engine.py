@@ -220,7 +220,9 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
 
 def test_what_a_process_wrote_before_it_was_killed_is_told_of_all_its_workers(transport):
     transport, _ = transport
-    transport._workers[0].child._log.write(b"waiting for a licence\n")
+    log = transport._workers[0].child._log
+    log.write(b"waiting for a licence\n")
+    log.flush()
     assert transport.kill(0) == "waiting for a licence"
     lost = transport.receive(0.0)
     assert isinstance(lost, WorkerLost)
