@@ -18,7 +18,7 @@ from es_service.config.parts import RESOURCES, TASK_OPTIONS
 from es_service.config.search import PRESETS, PopulationConfig, PresetRow, SearchConfig, preset_rows
 from es_service.protocol.messages import UNBOUNDED, Bounds, TaskSpec, with_options
 from es_service.protocol.options import defaults_of
-from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS, PolicySpec
+from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS, OF_RANKED, PolicySpec
 from es_service.protocol.rollouts import CHUNK_PAIRS, Rollouts, choose
 
 CHUNKS = 8
@@ -108,7 +108,9 @@ class Values(Mapping[str, Any]):
     @property
     def policy(self) -> PolicySpec:
         """The policy. Raises Unknown."""
-        return policy_spec_of(self, self.task.observation_size, self.task.action_size)
+        return policy_spec_of(
+            self, self.task.observation_size, self.task.action_size, is_ranked=self.task.ranked_actions
+        )
 
     @property
     def on_gpu(self) -> bool:
@@ -207,12 +209,19 @@ def options_of(values: Mapping[str, Any]) -> dict[str, Any]:
     return {key.removeprefix(TASK_OPTIONS): value for key, value in values.items() if key.startswith(TASK_OPTIONS)}
 
 
-def policy_spec_of(values: Mapping[str, Any], observation_size: int, action_size: int) -> PolicySpec:
-    """The policy that values of a config make, by dotted key; keys that are missing have their defaults."""
+def policy_spec_of(
+    values: Mapping[str, Any], observation_size: int, action_size: int, *, is_ranked: bool = False
+) -> PolicySpec:
+    """The policy that values of a config make, by dotted key; keys that are missing have their defaults.
+
+    Args:
+        is_ranked: `TaskSpec.ranked_actions`.
+    """
     names = ("hidden", "activation", "output", "bias", "memory")
     hidden, activation, output, bias, memory = (
         values.get(f"policy.{name}", FIELDS[f"policy.{name}"].default) for name in names
     )
+    output = OF_RANKED.get(output, output) if is_ranked else output
     return PolicySpec((observation_size, *hidden, action_size), activation, output, bias, memory or 0)
 
 

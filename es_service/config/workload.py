@@ -19,7 +19,7 @@ from es_service.protocol.sources import worker_sources
 def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
     """The policy of a run, from the task's observation to its action."""
     values = {f"policy.{name}": value for name, value in config.policy}
-    return policy_spec_of(values, task.observation_size, task.action_size)
+    return policy_spec_of(values, task.observation_size, task.action_size, is_ranked=task.ranked_actions)
 
 
 def require_episodes(task: TaskSpec, *, asks_caller: bool) -> None:

@@ -89,6 +89,9 @@ class TaskSpec:
     """What the task is made of, on which it depends which rollouts can compute it."""
     discrete_actions: bool = False
     """Whether an action is a choice of one of `action_size` actions, so that the policy has to choose one."""
+    ranked_actions: bool = False
+    """Whether an action has a number for each choice, of which the task takes the greatest that it allows, so that
+    `argmax` and `categorical` give it the numbers by which they would choose."""
     action_bounds: Bounds = ()
     """What the actions -1 and 1 of a policy become, (low, high) for each number of an action; empty if they stay -1 and
     1."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -13,10 +14,16 @@ from es_service.protocol.noise import NORMAL_STD, Keys, normals
 
 Activation = Literal["tanh", "relu"]
 Output = Literal["tanh", "linear", "argmax", "categorical", "gaussian"]
+PolicyOutput = Output | Literal["gumbel"]
+"""Values of `policy.output`, and what OF_RANKED makes of them."""
 NOISY_OUTPUTS = ("tanh", "linear")
 """Outputs to which action noise can be added: those that are numbers and not random by themselves."""
 DISCRETE_OUTPUTS = ("argmax", "categorical")
 """Outputs that choose one of the actions, which is then 1 while the others are 0."""
+OF_RANKED: Mapping[str, Literal["linear", "gumbel"]] = {"argmax": "linear", "categorical": "gumbel"}
+"""What these are for a task that takes the greatest number of what it allows (`TaskSpec.ranked_actions`): the numbers
+by which they would choose. Of any of the logits with Gumbel variates, the greatest has the probabilities of their
+softmax."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,7 @@ class PolicySpec:
     """Widths of the layers, from the observation to the action, without the memory."""
     activation: Activation = "tanh"
     """Function after each hidden layer."""
-    output: Output = "tanh"
+    output: PolicyOutput = "tanh"
     """What makes an action of the last layer; see `workers.policies.policy`."""
     bias: bool = True
     """Whether the layers have biases."""

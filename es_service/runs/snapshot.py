@@ -52,7 +52,9 @@ OF_CENTRES = {"centre": "INTEGER", "fitness_weight": "REAL", "fitness_mean": "RE
 
 def stored_policy_spec(meta: RunMeta) -> PolicySpec:
     """What a run's policies are."""
-    return policy_spec_of(meta.constants, meta.task["observation_size"], meta.task["action_size"])
+    task = meta.task
+    is_ranked = task.get("ranked_actions", False)  # which older versions did not record
+    return policy_spec_of(meta.constants, task["observation_size"], task["action_size"], is_ranked=is_ranked)
 
 
 def sizes_of(meta: RunMeta) -> Sizes:

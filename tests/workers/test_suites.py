@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from es_service import certify_run, run
+from es_service.config.resolution import policy_spec_of
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.sources import SUITES, task_code
 from workers.environments import TaskError, describe_environment, make_environment, suite_task
@@ -26,6 +27,7 @@ from workers.environments.suite_task import (
     require_known,
     suite_module,
 )
+from workers.policies.policy import action, drawn_action
 from workers.simd.episodes.kernel import compile_kernel
 
 SEEDS, STEPS = 20, 50
@@ -90,7 +92,9 @@ def test_observations_keys_actions_and_masks_of_a_suite() -> None:
     task = describe_suite(suite, {"descriptor": [5, 0]})
     assert (task.observation_size, task.action_size, task.episode_steps) == (8, 3, 9)
     assert task.descriptor_names == ("observation_5", "observation_0")
-    assert not task.discrete_actions  # its outputs are preferences among what the mask allows
+    assert (task.discrete_actions, task.ranked_actions) == (False, True)  # numbers among what the mask allows
+    of_one = describe_suite(grid(mask=None), {})
+    assert (of_one.discrete_actions, of_one.ranked_actions) == (True, False)
     key = keys()[0]
     raw = jnp.asarray(key[:2])
     state, place = environment.reset(key), int(jax.random.randint(jax.random.fold_in(raw, 0), (), 0, 5))
@@ -116,6 +120,30 @@ def test_several_choices_and_actuators() -> None:
     actuators = Actuators(np.array([[0.0, -2.0]]), np.array([[4.0, 2.0]]))
     np.testing.assert_allclose(actuators.of(jnp.array([-1.0, 9.0]), True), [[0.0, 2.0]])
     np.testing.assert_allclose(actuators.of(jnp.array([0.5, 0.0]), True), [[3.0, 0.0]])
+
+
+@pytest.mark.parametrize("output", ["argmax", "categorical"])
+def test_both_outputs_choose_among_what_a_mask_allows_and_in_each_of_several_choices(output: str) -> None:
+    """By the softmax of what is allowed; the outputs are preferences, of which a forbidden one is the greatest."""
+    spec = policy_spec_of({"policy.output": output}, 1, 5, is_ranked=describe_suite(grid(), {}).ranked_actions)
+    outputs, allowed = np.array([0.5, -0.5, 4.0, 1.0, 0.0], np.float32), jnp.array([True, True, False, True, True])
+    episode_keys = stream_keys(0, Domain.ACTION_NOISE, 0, np.arange(4096))
+    coordinates = jnp.arange(5, dtype=jnp.uint32)
+
+    def chosen(key: Any) -> Any:
+        numbers = drawn_action(jnp, spec.output, outputs, key, coordinates)
+        return Choices((3, 2), single=False).of(numbers, allowed)
+
+    taken = np.asarray(jax.jit(jax.vmap(chosen))(episode_keys))
+    if output == "argmax":
+        assert (taken == [0, 0]).all()
+    for column, expected in (0, [0.731, 0.269, 0.0]), (1, [0.731, 0.269]):
+        share = np.bincount(taken[:, column], minlength=len(expected)) / len(taken)
+        np.testing.assert_allclose(share, expected if output == "categorical" else np.eye(len(expected))[0], atol=0.025)
+    both = np.mean((taken == 0).all(1))  # the two are drawn by themselves
+    np.testing.assert_allclose(both, 0.731**2 if output == "categorical" else 1.0, atol=0.025)
+    in_evaluations = Choices((3, 2), single=False).of(action(jnp, spec.output, outputs), allowed)
+    np.testing.assert_array_equal(in_evaluations, [0, 0])
 
 
 def test_what_the_actions_1_become_is_told_with_a_task() -> None:

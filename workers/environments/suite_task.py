@@ -11,7 +11,7 @@ functions of a key, a state and an action. This module makes a task of it:
 - An action is a number for each actuator, of which -1 and 1 are the bounds and what is beyond is clipped; or one number
   for each choice, of which the greatest is taken, the first of equal ones. With several choices at a time, these follow
   one another, or there is one number for each combination if a mask is one of combinations. Choices that a mask forbids
-  are not taken.
+  are not taken: `argmax` and `categorical` choose among the others.
 - `task.options.descriptor` has indices of numbers of the last observation and names of measures, which are arrays that
   the suite tells besides, or is `module:function`, a function of the user's from the suite's last state to an array.
   Without it, the descriptor is the suite's own, or the number of steps.
@@ -211,6 +211,8 @@ def require_known(suite: str, name: str, names: Iterable[str]) -> None:
 def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
     """Description of an environment of a suite; `given` are values of options that are not the defaults."""
     (names, bounds), _, size = _descriptor(suite, given.get("descriptor"))
+    has_choices = isinstance(suite.actions, Choices)
+    takes_one = isinstance(suite.actions, Choices) and suite.actions.single and suite.mask is None
     facts = {"final_fitness": False, "has_goal": False, "summary": f"an environment of {suite.name.partition(':')[0]}"}
     return TaskSpec(
         name=suite.name,
@@ -221,7 +223,8 @@ def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
         descriptor_bounds=bounds,
         options={"descriptor": Option(None), **suite.options},
         action_bounds=suite.actions.bounds,
-        discrete_actions=isinstance(suite.actions, Choices) and suite.actions.single and suite.mask is None,
+        discrete_actions=takes_one,
+        ranked_actions=has_choices and not takes_one,
         **{**facts, **suite.facts},
     )
 

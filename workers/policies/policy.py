@@ -10,6 +10,10 @@ argmax: the action with the greatest output is 1, the first of equal ones, and t
 categorical: the same, drawn with probabilities that are the softmax of the outputs.
 gaussian: tanh of a normal variate, whose mean and log of the standard deviation are the two halves of the outputs.
 
+A task may choose by itself, such as where a mask forbids some actions (`TaskSpec.ranked_actions`). It takes the action
+with the greatest of the numbers that it gets: the outputs, or with `categorical` the outputs plus Gumbel variates
+(`gumbel`).
+
 Only training episodes draw. In evaluations `categorical` takes the most probable action, as `argmax` does, and
 `gaussian` the tanh of the mean.
 """
@@ -23,7 +27,7 @@ import numpy as np
 
 from es_service.protocol.messages import SIGNS, FloatArray, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys, uniforms
-from es_service.protocol.policy_spec import Activation, Output, PolicySpec, noise_integers
+from es_service.protocol.policy_spec import Activation, PolicyOutput, PolicySpec, noise_integers
 
 _SIGNS_S = np.asarray(SIGNS, np.float32)
 
@@ -162,7 +166,7 @@ LEAST_UNIFORM = np.float32(2.0**-25)
 """Replacement of a uniform variate of 0: half of the distance between variates."""
 
 
-def action(xp: Any, output: Output, outputs: Any) -> Any:
+def action(xp: Any, output: PolicyOutput, outputs: Any) -> Any:
     """Action [..., A] of an evaluation, from the outputs of the last layer [..., A], or [..., 2 A] of `gaussian`."""
     if output in ("argmax", "categorical"):
         return _chosen(xp, outputs)
@@ -171,17 +175,18 @@ def action(xp: Any, output: Output, outputs: Any) -> Any:
     return outputs
 
 
-def drawn_action(xp: Any, output: Output, outputs: Any, key: Any, coordinates_A: Any) -> Any:
+def drawn_action(xp: Any, output: PolicyOutput, outputs: Any, key: Any, coordinates_A: Any) -> Any:
     """Action [A] of a step of training, before action noise; without draws it is that of an evaluation.
 
     Args:
         key: stream key of the episode's action noise.
         coordinates_A: the step's coordinates in that stream, uint32.
     """
-    if output == "categorical":
+    if output in ("categorical", "gumbel"):
         # The greatest of logits + Gumbel variates has the probabilities of the softmax.
         uniform_A = xp.maximum(uniforms(key, coordinates_A), LEAST_UNIFORM)
-        return _chosen(xp, outputs - xp.log(-xp.log(uniform_A)))
+        numbers_A = outputs - xp.log(-xp.log(uniform_A))
+        return numbers_A if output == "gumbel" else _chosen(xp, numbers_A)
     if output == "gaussian":
         half = outputs.shape[-1] // 2
         std_A = xp.exp(xp.clip(outputs[..., half:], *map(np.float32, LOG_STD)))

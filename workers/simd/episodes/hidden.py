@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.policy_spec import Activation, Output, PolicySpec
+from es_service.protocol.policy_spec import Activation, PolicyOutput, PolicySpec
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Names
 from workers.simd.backend.native import ALIGNMENT, aligned
@@ -69,7 +69,7 @@ class Network(NamedTuple):
     """Places in the flat vector of parameters: of the vectors, then of the single weights."""
     target: Target
     """Target of the code, whose vectors these are."""
-    output: Output
+    output: PolicyOutput
     """Function of the last layer's sums; all but `tanh` are computed elsewhere."""
     bias: bool
 
