@@ -21,7 +21,14 @@ from es_service.protocol.messages import with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.sources import sha256, user_sources
 from tests.mujoco_models import c_step, relative_error
-from workers.environments import TaskError, describe_environment, make_environment, make_host_task, mujoco_gym
+from workers.environments import (
+    TaskError,
+    describe_environment,
+    make_environment,
+    make_host_task,
+    mujoco_gym,
+    mujoco_parts,
+)
 from workers.environments.mujoco_gym_parts import Feet, GymState
 from workers.environments.mujoco_gym_tasks import TASKS
 from workers.environments.mujoco_parts import MujocoState, mujoco
@@ -206,6 +213,21 @@ def test_resets_have_gymnasiums_distributions(name: str):
     np.testing.assert_allclose(observed.std(0), spread, rtol=0.2, atol=1e-6)
     assert (np.abs(observed.mean(0) - gyms.mean(0)) <= 0.4 * spread + 1e-6).all()
     assert (np.abs(observed).max(0) <= np.abs(gyms).max(0) + spread + 1e-6).all()
+
+
+def test_physics_is_traced_once_for_all_kernels(monkeypatch):
+    """Training and evaluation share a step's trace, in which MuJoCo's forward stands once, though RK4 in a loop of
+    substeps needs it for shapes and for code; the numbers are those of the undecorated function."""
+    unsolved, traces = mujoco_parts._unsolved, []
+    monkeypatch.setattr(mujoco_parts, "_unsolved", lambda *given: traces.append(1) or unsolved(*given))
+    environment = make_environment("mujoco:InvertedPendulum-v5", {"frame_skip": 2})
+    state, action = jax.eval_shape(environment.reset, KEYS[0]), jax.ShapeDtypeStruct((1,), jnp.float32)
+    traces.clear()
+    plain = jax.make_jaxpr(lambda state, action: environment.step.__wrapped__(state, action))(state, action)
+    again = jax.make_jaxpr(lambda state, action: environment.step(state, action))(state, action)
+    jax.make_jaxpr(lambda state, action: environment.step(state, action)[0])(state, action)
+    assert len(traces) == 2
+    assert str(plain) == str(again)
 
 
 @pytest.mark.parametrize("name", HUMANOIDS)

@@ -19,7 +19,16 @@ from workers.environments.ant import Ant, joint_noise
 from workers.environments.ant_model import SUBSTEPS, ant_model, boxes_of, compiled, first_qpos
 from workers.environments.ant_tasks import FORCE_LIMIT, JOINTS, STEP_S
 from workers.environments.brax_task import quietly
-from workers.environments.mujoco_parts import MujocoState, mjx, mujoco, mujoco_viewer, put_model, start, step_and_look
+from workers.environments.mujoco_parts import (
+    MujocoState,
+    mjx,
+    mujoco,
+    mujoco_viewer,
+    once,
+    put_model,
+    start,
+    step_and_look,
+)
 from workers.environments.walls import least
 
 # Contacts of spheres and capsules with walls that are upright boxes, as C MuJoCo finds them, in MJX.
@@ -223,6 +232,7 @@ def make_ant(walls: tuple[Segment, ...] = (), integrator: str = "RK4") -> Ant:
         found: Any = mjx.rne_postconstraint(mx, data)
         return found._impl.cfrc_ext
 
+    @once
     def step(state: MujocoAntState, action: Any) -> MujocoAntState:
         ctrl = jnp.clip(action, -1.0, 1.0)
         return MujocoAntState(*step_and_look(mx, state.physics, ctrl, SUBSTEPS, look, contacts=contacts))

@@ -29,7 +29,16 @@ from workers.environments.host_task import action_bounds
 from workers.environments.mujoco_contacts import feet_of, touching
 from workers.environments.mujoco_gym_parts import Feet, GymState, Parts, Simulated
 from workers.environments.mujoco_gym_tasks import TASKS, GymTask
-from workers.environments.mujoco_parts import MjModel, forward, mujoco, mujoco_viewer, put_model, start, step_and_look
+from workers.environments.mujoco_parts import (
+    MjModel,
+    forward,
+    mujoco,
+    mujoco_viewer,
+    once,
+    put_model,
+    start,
+    step_and_look,
+)
 
 FAR = 30.0
 """Bound of descriptors whose range is not specified, in metres or in the unit of the joint."""
@@ -105,6 +114,7 @@ def make(
     low_A, high_A = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
     middle_A, half_A = 0.5 * low_A + 0.5 * high_A, 0.5 * high_A - 0.5 * low_A
 
+    @once
     def reset(key: Any) -> GymState:
         counts = Feet(jnp.zeros(len(feet)), jnp.float32(0.0)) if feet else None
         return of.at(*parts.start(key))._replace(feet=counts)
@@ -112,6 +122,7 @@ def make(
     def ctrl(action: Any) -> Any:
         return jnp.clip(middle_A + half_A * action, low_A, high_A)
 
+    @once
     def step(state: GymState, action: Any) -> tuple[GymState, Any, Any]:
         bounded_A = ctrl(action)
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 import importlib
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -39,6 +40,11 @@ MjModel = Any
 LIMITS = ("max_contact_points", "max_geom_pairs")
 """Custom numbers (`numeric`) of a model that limit its contacts in MJX: most contacts of each `condim`, the deepest
 first, and most pairs of geoms of each two types, the nearest first. C MuJoCo knows none."""
+
+
+once: Any = partial(jax.jit, inline=True)
+"""Decorator: a function that JAX traces once for all that call it, and that leaves no trace of its own in what they
+compute. MJX's forward takes seconds to trace, and without this it is traced for each shape, loop and kernel again."""
 
 
 class MujocoState(NamedTuple):
@@ -130,9 +136,10 @@ def step_and_look(
         contacts: functions that find contacts of two types of geoms, in place of those of MJX.
     """
     integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _single_stage
+    forward = once(lambda data: _forward(model, data, at_once))
 
     def substep(before: tuple[MujocoState, Any], _: None) -> tuple[tuple[MujocoState, Any], None]:
-        return integrate(model, _data(mjx.make_data(model), before[0], ctrl), look, at_once), None
+        return integrate(model, _data(mjx.make_data(model), before[0], ctrl), look, forward), None
 
     with contacts_as_c(contacts):
         first = jax.eval_shape(lambda: substep((state, ()), None)[0][1])
@@ -147,17 +154,21 @@ INTEGRATORS = {
 """What MJX does after the forces are known, by the integrator; for RK4 see `_runge_kutta`."""
 
 
+Forward = Callable[[Any], Any]
+"""Function from data to data with the forces."""
+
+
 def _single_stage(
-    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], at_once: int
+    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], forward: Forward
 ) -> tuple[MujocoState, Any]:
     """A substep of an integrator that computes forces once, and what is seen in it."""
-    found = _forward(model, data, at_once)
+    found = forward(data)
     after = INTEGRATORS[model.opt.integrator](model, found)
     return _state(after), look(found.replace(qpos=after.qpos, qvel=after.qvel, act=after.act, time=after.time))
 
 
 def _runge_kutta(
-    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], at_once: int
+    model: mjx.Model, data: mjx.Data, look: Callable[[mjx.Data], Any], forward: Forward
 ) -> tuple[MujocoState, Any]:
     """A substep of RK4, and what is seen in its fourth stage.
 
@@ -178,7 +189,7 @@ def _runge_kutta(
         share = jnp.where(number == 0, 0.0, jnp.where(is_inner, 0.5, 1.0))
         weight = jnp.where(is_inner, 1.0 / 3.0, 1.0 / 6.0)
         at = moved(rates, share)
-        found = _forward(model, at.replace(qacc_warmstart=data.qacc_warmstart), at_once)
+        found = forward(at.replace(qacc_warmstart=data.qacc_warmstart))
         turned = _turning(model, share * model.opt.timestep * rates[0], found.qvel)
         rates = turned, found.qacc, found.act_dot
         sums = jax.tree.map(lambda total, rate: total + weight * rate, sums, rates)

@@ -45,7 +45,8 @@ def why_not(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType(
         given: values of options; the others have their defaults.
     """
     try:
-        training_program(task, option_values(task.options, given)).text()
+        options = option_values(task.options, given)
+        training_program(task, options, make_environment(task.name, options)).text()
     except UnsupportedError as error:
         return str(error)
     except Exception as error:  # also after a fault of the compiler, xla can run the task
@@ -53,8 +54,11 @@ def why_not(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType(
     return ""
 
 
-def training_program(task: TaskSpec, options: Mapping[str, OptionValue]) -> EpisodeProgram:
+def training_program(task: TaskSpec, options: Mapping[str, OptionValue], environment: Environment) -> EpisodeProgram:
     """The program of a task's training episodes with a small policy.
+
+    Args:
+        environment: that of the task with these options.
 
     Raises:
         UnsupportedError: a step of the task cannot be compiled.
@@ -75,8 +79,7 @@ def training_program(task: TaskSpec, options: Mapping[str, OptionValue]) -> Epis
         gradient_block_pairs=1,
         rollout="simd",
     )
-    environment, inputs_O = make_environment(task.name, options), np.arange(task.observation_size)
-    return write_episodes(environment, spec, inputs_O, target_of("avx2"), training=True)
+    return write_episodes(environment, spec, np.arange(task.observation_size), target_of("avx2"), training=True)
 
 
 def make_training_rollout(

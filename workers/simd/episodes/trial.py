@@ -119,8 +119,9 @@ def examine(task: TaskSpec, given: Mapping[str, OptionValue] = MappingProxyType(
 def _key(task: TaskSpec, options: Mapping[str, OptionValue]) -> str:
     """Key of all on which `examine` depends; empty if that has no text."""
     try:
-        reset = jax.make_jaxpr(make_environment(task.name, options).reset)(KEY)
-        text = f"examined {training_program(task, options).name} {jaxpr_digest(reset)} {OWN_VERSION}"
+        environment = make_environment(task.name, options)
+        reset = jax.make_jaxpr(environment.reset)(KEY)
+        text = f"examined {training_program(task, options, environment).name} {jaxpr_digest(reset)} {OWN_VERSION}"
     except Exception:  # `why_not` tells what it is
         return ""
     return hashlib.sha256(text.encode()).hexdigest()
