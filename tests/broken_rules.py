@@ -156,6 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/common.py"
+NEAREST = "es_service/protocol/nearest.py"
 NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/common.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
 RECIPES = "es_service/protocol/policies.py"
@@ -205,12 +206,12 @@ CASES = [
         OF_NOVELTY,
         (
             "a tree's candidate",
-            NOVELTY,
+            NEAREST,
             "near_Q_K[candidate_Q_K == excluded_Q[:, None]]",
             "near_Q_K[candidate_Q_K < 0]",
         ),
-        ("within a tree's radius", NOVELTY, "near_1_K[:, within == excluded_Q[index]]", "near_1_K[:, within < 0]"),
-        ("in no tree", NOVELTY, "squared_Q_N[rows, excluded_Q[rows] - first]", "squared_Q_N[rows, :0]"),
+        ("within a tree's radius", NEAREST, "near_1_K[:, within == excluded_Q[index]]", "near_1_K[:, within < 0]"),
+        ("in no tree", NEAREST, "squared_Q_N[rows, excluded_Q[rows] - first]", "squared_Q_N[rows, :0]"),
         ("one of the newest", NOVELTY, "excluded_Q - (archive.size - newest), -1)", "0 * excluded_Q - 1, -1)"),
     ),
     *cases(

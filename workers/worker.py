@@ -34,6 +34,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
     chunk_name,
 )
+from es_service.protocol.nearest import NOVELTY, ArchiveEntries
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import POLICIES_TOGETHER, slots
 from workers import progress
@@ -163,9 +164,11 @@ def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], K
         )
 
     def training_results(work: Sequence[tuple[Centre, TrainingChunk]], episodes: Episodes) -> list[ChunkResult]:
-        shift_O = work[0][0].observation_mean_O
+        centre = work[0][0]
+        shift_O = centre.observation_mean_O
         parts = zip(work, _split(episodes, spec.chunk_pairs), strict=True)
-        return [_told(spec, subject_chunk, part, training_result(part, shift_O)) for subject_chunk, part in parts]
+        results = [_told(spec, subject_chunk, part, training_result(part, shift_O)) for subject_chunk, part in parts]
+        return [*results] if centre.archive is None else [*_with_novelty(results, centre.archive)]
 
     def evaluation_arguments(work: Sequence[tuple[Centre, EvaluationChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
@@ -207,6 +210,15 @@ def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], K
         GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
         PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec), partial(_policy_results, spec)),
     }
+
+
+def _with_novelty(results: Sequence[EpisodesResult], archive: ArchiveEntries) -> list[EpisodesResult]:
+    """The results of a centre's training chunks with the novelty of their members."""
+    novelty_C = archive.novelty(np.stack([result.descriptor for result in results]))
+    return [
+        replace(result, outputs={**result.outputs, NOVELTY: novelty_P_S})
+        for result, novelty_P_S in zip(results, novelty_C, strict=True)
+    ]
 
 
 def _wanted(chunk: EvaluationChunk) -> Any:

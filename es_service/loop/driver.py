@@ -46,6 +46,7 @@ from es_service.loop.generation import (
     initial_state,
     make_centre,
     tell,
+    with_archive,
 )
 from es_service.loop.history import HistoryRow
 from es_service.loop.state import Generation, RunState, Search, Stop, Store, Stored
@@ -305,6 +306,7 @@ def _asked(
         make_centre(config, number, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
         for ask in asks
     ]
+    centres = with_archive(centres, asks, begun.archive, config.novelty)
     policies = policies_asked(config, search.task, number, asked)
     pairs = [ask.pairs for ask in asks]
     results, observed, of_policies = yield from evaluate_populations(
@@ -320,7 +322,7 @@ def _asked(
         require_state(stepped, "step", number, ask.centre, gradient_D.size)
     # New centres are evaluated with the observation statistics of the generation's start.
     new_centres = [
-        replace(centre, parameters_D=stepped.centres[ask.centre].centre_D)
+        replace(centre, parameters_D=stepped.centres[ask.centre].centre_D, archive=None)
         for ask, centre in zip(asks, centres, strict=True)
     ]
     require_finite(new_centres, config.search, number)

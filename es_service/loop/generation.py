@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from es_service.config.model import RunConfig
+from es_service.config.sections import NoveltyConfig
 from es_service.errors import EvaluationError
 from es_service.loop.checks import require_columns, require_state
 from es_service.loop.contents import PolicyWork
@@ -35,8 +36,10 @@ from es_service.protocol.messages import (
     evaluation_chunks,
     with_subject,
 )
+from es_service.protocol.nearest import archive_entries
 from es_service.search.algorithms.base import (
     Algorithm,
+    Ask,
     CentreEvaluations,
     CentreState,
     SearchState,
@@ -46,9 +49,13 @@ from es_service.search.algorithms.base import (
 from es_service.search.algorithms.common import first_state
 from es_service.search.maps.behaviour_map import empty_map, with_names
 from es_service.search.maps.geometry import make_geometry
+from es_service.search.novelty import NoveltyArchive
+from es_service.search.shaping import weight_of_fitness, weighted
 from es_service.search.steps import norm
 
 AnyResult = TypeVar("AnyResult", EpisodesResult, GradientResult)
+NOVEL_MEMBERS = 4096
+"""Members of a generation from which on workers compute their novelty. It takes a core about 10 microseconds each."""
 
 
 def initial_state(search: Search) -> RunState:
@@ -81,6 +88,25 @@ def make_centre(
     """
     mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
     return Centre(generation, centre_D, sigma, mean_O, std_O)
+
+
+def with_archive(
+    centres: Sequence[Centre], asks: Sequence[Ask], archive: NoveltyArchive, settings: NoveltyConfig
+) -> list[Centre]:
+    """The centres of populations, with the novelty archive for those whose members are ranked by novelty, if there are
+    so many of these that the driver would hold up the workers. The novelty has the same bits wherever it is computed.
+
+    Args:
+        archive: as it was before the generation.
+    """
+    is_novel = [weight_of_fitness(ask.objective or weighted(ask.fitness_weight)) < 1.0 for ask in asks]
+    members = sum(2 * ask.pairs for ask, novel in zip(asks, is_novel, strict=True) if novel)
+    if members < NOVEL_MEMBERS or not archive.size:
+        return [*centres]
+    entries = archive_entries(archive.descriptor_N_B, settings.newest, settings.neighbours, settings.distance)
+    return [
+        replace(centre, archive=entries) if novel else centre for centre, novel in zip(centres, is_novel, strict=True)
+    ]
 
 
 def evaluate_populations(

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.nearest import ArchiveEntries
 from es_service.protocol.options import Option, OptionValue, ParameterSpec
 from es_service.protocol.policies import FloatArray, Policies, PolicyChunk, Recipes
 from es_service.protocol.policy_spec import PolicySpec
@@ -227,6 +228,8 @@ class Centre:
     observation_std_O: FloatArray
     """Statistics at the start of the generation, or those of the elite with which the block started; 0 and 1 if
     normalisation is off."""
+    archive: ArchiveEntries | None = None
+    """The novelty archive before the generation, if workers compute the novelty of the members."""
 
 
 _NOTHING = np.zeros(0, np.float32)
@@ -378,7 +381,7 @@ class EpisodesResult:
     success: bool, whether the episode succeeded as the task declares it; metrics [..., M]: those that the task
     records, in the order of `TaskSpec.metric_names`, float32; last_reward: reward of the last valid step;
     last_observation [..., O]: observation after it; first_observation [..., O]: that of the reset. A member has the
-    mean of its episodes, float32."""
+    mean of its episodes, float32. Not named there: `nearest.NOVELTY`."""
     of_steps: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Outputs of each step that it names, [K, ...]: the valid steps of all episodes, one episode after another in the
     order of the other arrays, with as many rows as `steps` says of each.

@@ -17,7 +17,8 @@ from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.content import Cache
-from es_service.protocol.messages import FloatArray, Subject, Work, recipes_in
+from es_service.protocol.messages import Centre, FloatArray, Subject, Work, recipes_in
+from es_service.protocol.nearest import ArchiveEntries
 from es_service.protocol.policies import Origin, Policies, Recipes, parent_name, recipes_again
 
 Value = TypeVar("Value")
@@ -37,8 +38,8 @@ class LackingError(Exception):
 
 
 class Memory(Cache[bytes, Value]):
-    """What a worker has of the arrays of work, by name: parents of recipes until newer ones need their room, and others
-    until a work item does not need them.
+    """What a worker has of the arrays of work, by name: parents of recipes and entries of the novelty archive until
+    newer ones need their room, and others until a work item does not need them.
 
     What the worker has and its sender does not know of is always older than the rest, and so forgotten first.
     """
@@ -48,13 +49,13 @@ class Memory(Cache[bytes, Value]):
         super().__init__(size_of)
         self._most_bytes = most_bytes
         self._passing: frozenset[bytes] = frozenset()
-        """What the last item needed that is no parent of recipes."""
+        """What the last item needed that is none of these."""
 
     def needed(self, names: Mapping[bytes, object], parents: Collection[bytes]) -> None:
         """Make what a work item needs the newest, and forget what there is no room for.
 
         Args:
-            parents: those of the names that are parents of recipes.
+            parents: those of the names that are parents of recipes, or entries of the archive.
         """
         for name in self._passing.difference(names):
             self.forget(name)
@@ -83,6 +84,7 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
     needed: dict[bytes, FloatArray] = {}
     origins_of: dict[bytes, Mapping[bytes, Origin]] = {}
     written: dict[int, Subject] = {}
+    named_entries: dict[int, ArchiveEntries] = {}
     for subject in {id(subject): subject for subject, _ in work}.values():
         written[id(subject)] = subject
         if (recipes := recipes_in(subject)) is not None:
@@ -94,6 +96,13 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
             shape = b"" if array.ndim == 1 else repr(array.shape).encode()  # [1, D] has the bits of [D]
             needed[name := parent_name(array) + shape] = array
             written[id(subject)] = _with(subject, name)
+        if (entries := _archive(subject)) is not None:
+            if id(entries) not in named_entries:
+                named_entries[id(entries)] = replace(entries, arrays=())
+                named = dict(zip(entries.names, entries.arrays, strict=True))
+                needed |= named
+                origins_of |= {name: {} for name in named}
+            written[id(subject)] = replace(written[id(subject)], archive=named_entries[id(entries)])
     arrays: dict[bytes, FloatArray] = {}
     origins: dict[bytes, Origin] = {}
     for name, array in needed.items():
@@ -113,6 +122,10 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
 
 def _parameters(subject: Subject) -> Any:
     return subject.parameters_N_D if isinstance(subject, Policies) else subject.parameters_D
+
+
+def _archive(subject: Subject) -> ArchiveEntries | None:
+    return subject.archive if isinstance(subject, Centre) else None
 
 
 def _with(subject: Subject, parameters: Any) -> Subject:
@@ -149,6 +162,8 @@ class Received:
         """
         self.memory: Memory[FloatArray] = Memory(most_bytes, attrgetter("nbytes"))
         self._made = made
+        self._archive: ArchiveEntries | None = None
+        """The newest entries of the novelty archive, whose tree serves until there are more."""
 
     def add(self, arrays: Mapping[bytes, FloatArray]) -> None:
         """Take arrays, which come before the item that needs them."""
@@ -172,6 +187,11 @@ class Received:
                 elif isinstance(name := _parameters(subject), bytes):
                     read[id(subject)] = _with(subject, self.memory[name])
                     names[name] = None
+                if (entries := _archive(subject)) is not None:
+                    self._archive = entries.complete(self.memory, self._archive)
+                    read[id(subject)] = replace(read[id(subject)], archive=self._archive)
+                    names |= dict.fromkeys(entries.names)
+                    parents.update(entries.names)
         except KeyError as error:
             raise LackingError from error
         self.memory.needed(names, parents)

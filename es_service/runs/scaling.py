@@ -28,7 +28,7 @@ from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
 from es_service.loop.budget import REACHED
 from es_service.loop.evaluated import policies_asked
-from es_service.loop.generation import initial_state
+from es_service.loop.generation import initial_state, with_archive
 from es_service.loop.state import no_observations
 from es_service.protocol.episodes import addressed, each
 from es_service.protocol.machine import platform_text
@@ -38,17 +38,19 @@ from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
     GradientChunk,
+    TaskSpec,
     TrainingChunk,
     Work,
     WorkerSpec,
     evaluation_chunks,
 )
+from es_service.protocol.nearest import NOVELTY
 from es_service.protocol.policies import Policies, Recipes
 from es_service.protocol.sent import Received
 from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
-from es_service.search.novelty import extended
+from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState
+from es_service.search.novelty import archive_of, extended
 from es_service.store.create import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
@@ -84,7 +86,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     search, spec, phases = config.search, worker_spec(config, task_of(config)), _phases(config)
     centres = _initial_centres(config, spec)
     works = [_work(phase, centres, spec, config) for phase in phases]
-    initial = [(centres[0], chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
+    initial = [(replace(centres[0], archive=None), chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
     chunk_s, answers = _chunk_costs(spec, [*works, initial])
     message_s, way_s, chunk_message_s = _message_costs(spec, works, answers)
     costs = Costs(chunk_s, message_s, way_s, *_driver_cost(config, answers), chunk_message_s)
@@ -102,10 +104,27 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
 
 
 def _initial_centres(config: RunConfig, spec: WorkerSpec) -> list[Centre]:
+    """A centre for each population of a generation, with a novelty archive where workers need one."""
     search, zeros_O = config.search, np.zeros(spec.policy.widths[0], np.float32)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
     sigma = search.sigma if isinstance(search, PopulationConfig) else 0.0
-    return [Centre(1, parameters, sigma, zeros_O, zeros_O + 1.0) for _ in range(max(1, search.populations()))]
+    centres = [Centre(1, parameters, sigma, zeros_O, zeros_O + 1.0) for _ in range(max(1, search.populations()))]
+    if not isinstance(search, PopulationConfig):
+        return centres
+    begun = _search(config)
+    asks = [ask for ask in begun.algorithm.ask(initial_state(begun).search, 1) if isinstance(ask, Ask)]
+    none_N = np.zeros(PAST_ENTRIES, np.int64)
+    archive = archive_of(_past(np.random.default_rng(0), _bounds(begun.task)), none_N, none_N)
+    return with_archive(centres, asks, archive, config.novelty)
+
+
+def _bounds(task: TaskSpec) -> np.ndarray:
+    return np.clip(task.descriptor_bounds, -UNBOUNDED, UNBOUNDED)
+
+
+def _past(random: np.random.Generator, bounds_B_2: np.ndarray) -> np.ndarray:
+    """Descriptors of earlier entries of the novelty archive."""
+    return random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
 
 
 def _phases(config: RunConfig) -> list[Phase]:
@@ -132,7 +151,7 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: Run
     if phase.name == "rollout":
         return [(centre, TrainingChunk(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
     return [
-        (centre, chunk)
+        (replace(centre, archive=None), chunk)
         for ask, centre in enumerate(centres)
         for chunk in evaluation_chunks(1, config.search.evaluation_episodes, ask=ask)
     ]
@@ -251,7 +270,10 @@ def _for_chunk(answer: ChunkResult, work: Work) -> ChunkResult:
     if isinstance(subject, Policies) and trace_T_B is not None:
         trace_T_B = trace_T_B[: int((row_N % subject.episodes == 0).sum())]
     cut = each(lambda array: array[: len(row_N)], answer, traces=False)
-    return addressed(work, replace(cut, moments=answer.moments, trace_T_B=trace_T_B))
+    outputs = {name: array for name, array in cut.outputs.items() if name != NOVELTY}
+    if isinstance(subject, Centre) and subject.archive is not None:
+        outputs[NOVELTY] = np.float64(cut.fitness)
+    return addressed(work, replace(cut, moments=answer.moments, trace_T_B=trace_T_B, outputs=outputs))
 
 
 def _moved(answer: ChunkResult, random: np.random.Generator, bounds_B_2: np.ndarray) -> ChunkResult:
@@ -296,10 +318,9 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
     config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
     search = _search(config)
     task = search.task
-    random, bounds_B_2 = np.random.default_rng(0), np.clip(task.descriptor_bounds, -UNBOUNDED, UNBOUNDED)
+    random, bounds_B_2 = np.random.default_rng(0), _bounds(task)
     if isinstance(config.search, PopulationConfig):  # with policies, only the first ones enter the archive
-        past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
-        search = replace(search, algorithm=_with_past(search.algorithm, past_N_B))
+        search = replace(search, algorithm=_with_past(search.algorithm, _past(random, bounds_B_2)))
     history, evaluations = columns(config, task)
     meta = RunMeta(
         run_id=f"{0:032x}",

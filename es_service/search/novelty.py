@@ -1,77 +1,25 @@
 """Novelty: mean distance of a descriptor to its nearest entries of the novelty archive.
 
 Source: Conti et al. 2018 (arXiv:1712.06560). With our searches the novelty archive only grows: it gets one entry for
-each valid evaluated centre, in order. In a large archive a k-d tree proposes the candidates, but distances are always
-computed by the same float64 expression, so the tree does not change any bit of the result.
+each valid evaluated centre, in order. `protocol/nearest.py` computes the distances, here or where the members are.
 
-Axes: N entries of the novelty archive, Q queries, K nearest candidates or entries in the tree, B descriptor dimensions.
+Axes: N entries of the novelty archive, Q queries, B descriptor dimensions.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.protocol.machine import usable_cpus
-
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
-
-
-COPIES = 64
-"""Largest number of entries with equal descriptors in a tree. Policies that do not move, or that end in a corner,
-produce many such entries, and each query near them would visit them all."""
-
-
-@dataclass(frozen=True)
-class Tree:
-    """A k-d tree over the first entries of an archive."""
-
-    kd: KDTree
-    entries: int
-    """Number of those entries."""
-    entry_K: NDArray[np.int64] | None
-    """Indices of the entries that are in the tree; None for all of them."""
-
-    def entries_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Indices of the entries for points of the tree."""
-        return np.asarray(points) if self.entry_K is None else self.entry_K[np.asarray(points)]
-
-
-def make_tree(descriptor_N_B: NDArray[np.float64]) -> Tree:
-    """A tree over all entries, with at most the first COPIES of those with equal descriptors."""
-    from scipy.spatial import KDTree  # imported late: it takes 0.25 s, and most runs do not need it
-
-    size = len(descriptor_N_B)
-    word_N = np.zeros(size, np.uint64)
-    for b in range(descriptor_N_B.shape[1]):  # equal descriptors give equal hashes, others almost never
-        word_N = word_N * np.uint64(0x9E3779B97F4A7C15) + np.ascontiguousarray(descriptor_N_B[:, b]).view(np.uint64)
-    sorted_N = np.sort(word_N)
-    if not (sorted_N[COPIES:] == sorted_N[:-COPIES]).any():
-        return Tree(KDTree(descriptor_N_B), size, None)
-    order_N = np.lexsort(descriptor_N_B.T)
-    equal_N = (descriptor_N_B[order_N[COPIES:]] == descriptor_N_B[order_N[:-COPIES]]).all(axis=1)
-    entry_K = np.sort(np.concatenate([order_N[:COPIES], order_N[COPIES:][~equal_N]]))
-    return Tree(KDTree(descriptor_N_B[entry_K]), size, entry_K)
-
-
-Distance = Literal["euclidean", "squared_euclidean"]
+from es_service.protocol.nearest import Distance, Tree, make_tree, mean_distances
 
 TREE_STEP = 256
 """Least number of entries between two trees. Entries after the newest tree are compared one by one."""
 LEAST_ROOM = 256
 """Least capacity of an archive's arrays, in entries."""
-SPARE_CANDIDATES = 6
-"""Additional neighbours that are requested from the tree, so that an effect of its rounding can be noticed."""
-BLOCK = 1024
-"""Queries that are compared at a time, since more distances would leave the core's cache. While a run computes
-novelties, its workers wait, so each core takes a block. No query depends on another."""
-TREE_ROUNDING = 1e-9
-"""Generous bound on the relative difference between the tree's distances and ours."""
 
 
 @dataclass
@@ -196,21 +144,9 @@ def novelty(
     if newest is not None and newest < archive.size:
         excluded_Q = np.maximum(excluded_Q - (archive.size - newest), -1)
         archive = _newest(archive, newest)
-    finite_Q = np.atleast_1d(np.isfinite(query_Q_B).all(axis=1))
-    novelty_Q = np.full(len(query_Q_B), np.nan)
-
-    def fill(first: int) -> None:
-        rows = first + np.flatnonzero(finite_Q[first : first + BLOCK])
-        novelty_Q[rows] = _mean_nearest(archive, query_Q_B[rows], excluded_Q[rows], neighbours, distance)
-
-    blocks = range(0, len(query_Q_B), BLOCK)
-    threads = min(len(blocks), usable_cpus())
-    if threads > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, blocks))
-    else:
-        for first in blocks:
-            fill(first)
+    # While a run computes novelties, its workers wait, so each core of this machine takes a share of the queries.
+    entries = archive.descriptor_N_B, archive.tree
+    novelty_Q = mean_distances(*entries, query_Q_B, excluded_Q, neighbours, distance, usable_cpus())
     return novelty_Q.reshape(shape)
 
 
@@ -256,74 +192,3 @@ def _newest(archive: NoveltyArchive, count: int) -> NoveltyArchive:
             archive.descriptor_N_B[last], archive.generation_N[last], archive.centre_N[last]
         )
     return archive.newest[count]
-
-
-def _mean_nearest(
-    archive: NoveltyArchive,
-    query_Q_B: NDArray[np.float64],
-    excluded_Q: NDArray[np.int64],
-    neighbours: int,
-    distance: Distance,
-) -> NDArray[np.float64]:
-    """Mean distance of finite queries to their nearest entries, [Q]; from the tree's candidates if these suffice."""
-    tree = archive.tree
-    asked = neighbours + 1 + SPARE_CANDIDATES  # + 1 in case the excluded entry is among them
-    if tree is None or asked >= tree.kd.n or (tree.entry_K is not None and asked > COPIES):
-        return mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
-    reach_Q_K, point_Q_K = tree.kd.query(query_Q_B, asked)
-    candidate_Q_K = tree.entries_of(point_Q_K)
-    near_Q_K = squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
-    near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
-    tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.entries)
-    squared_Q_K = _smallest(near_Q_K, neighbours)
-    newer = np.flatnonzero((tail_Q_N < squared_Q_K[:, -1:]).any(axis=1))  # an entry after the tree is among the nearest
-    squared_Q_K[newer] = _smallest(np.concatenate([squared_Q_K[newer], tail_Q_N[newer]], axis=1), neighbours)
-    # A result is sure unless an entry that the tree did not return could, with rounding, be among the nearest.
-    sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
-    mean_Q = mean_smallest(squared_Q_K, neighbours, distance)
-    for index in np.flatnonzero(~sure_Q):  # such as many entries at equal distance, where episodes end at a border
-        single = slice(index, index + 1)
-        radius = reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)
-        within = tree.entries_of(tree.kd.query_ball_point(query_Q_B[index], radius))
-        near_1_K = squared_to(query_Q_B[single], archive.descriptor_N_B[None, within])
-        near_1_K[:, within == excluded_Q[index]] = np.inf
-        mean_Q[single] = mean_smallest(np.concatenate([near_1_K, tail_Q_N[single]], axis=1), neighbours, distance)
-    return mean_Q
-
-
-def _squared(
-    archive: NoveltyArchive, query_Q_B: NDArray[np.float64], excluded_Q: NDArray[np.int64], first: int = 0
-) -> NDArray[np.float64]:
-    """Squared distances [Q, N - first] to the entries from `first` on, infinite for the excluded entry."""
-    squared_Q_N = squared_to(query_Q_B, archive.descriptor_N_B[None, first:])
-    rows = np.flatnonzero(excluded_Q >= first)
-    squared_Q_N[rows, excluded_Q[rows] - first] = np.inf
-    return squared_Q_N
-
-
-def squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared distances [Q, N], (x0 - y0)^2 + (x1 - y1)^2 + ... in this order; the only place that computes them."""
-    total_Q_N = np.zeros(np.broadcast_shapes((len(query_Q_B), 1), entry_Q_N_B.shape[:2]))
-    squared_Q_N = np.empty_like(total_Q_N)
-    for b in range(query_Q_B.shape[1]):
-        np.subtract(query_Q_B[:, None, b], entry_Q_N_B[..., b], out=squared_Q_N)
-        total_Q_N += np.multiply(squared_Q_N, squared_Q_N, out=squared_Q_N)
-    return total_Q_N
-
-
-def _smallest(squared_Q_N: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """The `count` smallest values of each row in ascending order; all values if a row has fewer."""
-    if count < squared_Q_N.shape[1]:
-        squared_Q_N = np.partition(squared_Q_N, count - 1, axis=1)[:, :count]
-    return np.sort(squared_Q_N, axis=1)
-
-
-def mean_smallest(squared_Q_N: NDArray[np.float64], count: int, distance: Distance) -> NDArray[np.float64]:
-    """Mean of the `count` smallest finite distances of each row, [Q]; 0 for a row without any."""
-    squared_Q_K = _smallest(squared_Q_N, count)
-    distance_Q_K = np.sqrt(squared_Q_K) if distance == "euclidean" else squared_Q_K
-    there_Q_K = np.isfinite(distance_Q_K)
-    total_Q = np.zeros(len(squared_Q_K))
-    for k in range(distance_Q_K.shape[1]):  # added one by one, since np.sum may use another order
-        total_Q += np.where(there_Q_K[:, k], distance_Q_K[:, k], 0.0)
-    return total_Q / np.maximum(there_Q_K.sum(axis=1), 1)

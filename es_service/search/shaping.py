@@ -175,6 +175,7 @@ def utilities(
     archive: NoveltyArchive,
     settings: NoveltyConfig,
     shaping: Shaping,
+    novelty_P_S: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Utility of each member of a population, [P, S].
 
@@ -186,15 +187,16 @@ def utilities(
         archive: the novelty archive as it was before the generation.
         settings: how novelty is computed.
         shaping: how values become utilities.
+        novelty_P_S: novelty of each member, if it is known.
     """
     weight = weight_of_fitness(objective)
     utility_P_S = np.zeros(results.fitness.shape)
     if weight > 0.0:
         utility_P_S += weight * shaped(shaping, values(objective, results))
     if weight < 1.0:
-        novelty_P_S = novelty(archive, results.descriptor, **dict(settings))
-        novelty_P_S[np.isnan(results.fitness)] = np.nan
-        utility_P_S += (1.0 - weight) * shaped(shaping, novelty_P_S)
+        if novelty_P_S is None:
+            novelty_P_S = novelty(archive, results.descriptor, **dict(settings))
+        utility_P_S += (1.0 - weight) * shaped(shaping, np.where(np.isnan(results.fitness), np.nan, novelty_P_S))
     return utility_P_S
 
 

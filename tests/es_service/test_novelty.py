@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from es_service.protocol import nearest
+from es_service.protocol.nearest import COPIES, ROWS, archive_entries
 from es_service.search import novelty as search_novelty
 from es_service.search.novelty import (
-    COPIES,
     TREE_STEP,
     NoveltyArchive,
     empty_archive,
@@ -167,7 +168,7 @@ def test_many_queries_are_divided_and_change_no_bit(monkeypatch, cores):
     queries[[0, 13, 14, 49], 1] = math.nan
     whole = of(archive, queries, exclude=exclude)
     assert [i for i, one in enumerate(whole) if math.isnan(one)] == [0, 13, 14, 49]
-    monkeypatch.setattr(search_novelty, "BLOCK", 7)
+    monkeypatch.setattr(nearest, "BLOCK", 7)
     monkeypatch.setattr(search_novelty, "usable_cpus", lambda: cores)
     np.testing.assert_array_equal(of(archive, queries, exclude=exclude), whole)
 
@@ -241,3 +242,29 @@ def test_an_archive_that_a_search_has_cut_is_one_of_its_own_entries():
     np.testing.assert_array_equal(thinned.generation_N, np.arange(0, 100, 2))
     with pytest.raises(ValueError, match="arrays of the novelty archive"):
         sound_archive(replace(whole, generation_N=whole.generation_N[:50]))
+
+
+@pytest.mark.parametrize("newest", [None, 700, 40])
+@pytest.mark.parametrize("entries", [3, ROWS, 900])
+def test_entries_that_travel_by_name_give_the_same_bits(entries, newest):
+    """Each full array once, and a tree only where there is a new one."""
+    random = np.random.default_rng(entries)
+    places, queries = random.normal(size=(entries + 3 * ROWS, 2)), np.float32(random.normal(size=(5, 2, 2)))
+    queries[1, 1, 0] = np.nan
+    there: dict[bytes, np.ndarray] = {}
+    before, size_before = None, 0
+    for size in (entries, entries + 1, entries + ROWS, entries + 3 * ROWS):
+        sent = archive_entries(places[:size], newest, 10, "euclidean")
+        assert all(len(array) == ROWS for array in sent.arrays[:-1])
+        rows = size if before is None else size - size_before
+        assert sum(name not in there for name in sent.names) <= -(-rows // ROWS) + 1  # the last one grows
+        there |= zip(sent.names, sent.arrays, strict=True)
+        whole = replace(sent, arrays=()).complete(there, before)
+        assert whole.size == min(size, newest or size)
+        expected = novelty(many(places[:size]), queries, neighbours=10, distance="euclidean", newest=newest)
+        np.testing.assert_array_equal(whole.novelty(queries), expected)
+        assert whole.complete({}, whole) is whole
+        if size == entries + 1 and newest is None:
+            assert whole.tree is before.tree
+        assert (whole.tree is None) == (whole.first + whole.size < ROWS)
+        before, size_before = whole, size

@@ -1,12 +1,19 @@
 """Generations that ask for several populations equal the reference implementations; what their history says."""
 
+import pickle
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from es_service.loop import generation as generation_module
 from es_service.loop.generation import fittest
+from es_service.protocol import nearest
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
+from es_service.protocol.nearest import NOVELTY
+from es_service.protocol.policies import Recipes
+from es_service.protocol.sent import Memory, Received, parcel
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation, in_columns
 from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map, novelty_of_centres
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
@@ -33,6 +40,31 @@ from tests.references import novelty_search as novelty_reference
 from tests.references.behaviour_map import GridMap
 
 EMITTERS, CELLS = 3, (8, 8)
+
+
+class Elsewhere(Sharing):
+    """Each chunk is a message to one of two workers, which have of earlier ones what they were sent."""
+
+    def __init__(self):
+        super().__init__()
+        self.workers = [(Memory(2**20, int), Received(2**20, Recipes.made)) for _ in range(2)]
+        self.arrays = Counter()
+
+    def evaluate(self, work):
+        return [
+            result
+            for number, one in enumerate(work)
+            for result in super(Elsewhere, self).evaluate([self._there(number, one)])
+        ]
+
+    def _there(self, number, one):
+        memory, received = self.workers[number % 2]
+        arrays, origins, written = pickle.loads(pickle.dumps(parcel([one], memory)))
+        self.arrays.update((number % 2, name) for name in arrays)
+        received.add(arrays)
+        return received.work(origins, written)[0]
+
+
 NSRA = {"fitness_weight_start": 0.5, "fitness_weight_step": 0.125, "fitness_weight_patience": 2}
 
 
@@ -261,3 +293,32 @@ def test_the_fittest_valid_centre_is_shown_and_of_equal_ones_the_first():
     assert shown(-2.0, -1.0, -1.0) == 1
     assert shown(None, -3.0, -2.0) == 2
     assert shown(None, None) == 0
+
+
+@pytest.mark.parametrize("newest", [None, 20])
+def test_novelty_has_the_same_bits_where_the_members_are(monkeypatch, newest):
+    """And full arrays of the archive travel once to a worker, whatever it was sent between them."""
+    config = config_of(generations=12, cells=CELLS, emitters=EMITTERS)
+    config = config.model_copy(update={"novelty": config.novelty.model_copy(update={"newest": newest})})
+    _, here, _ = run_in_memory(config)
+    monkeypatch.setattr(nearest, "ROWS", 8)
+    monkeypatch.setattr(generation_module, "NOVEL_MEMBERS", 1)
+    _, there, evaluator = run_in_memory(config, Elsewhere())
+    for before, after in zip(here.after, there.after, strict=True):
+        assert before.keys() == after.keys()
+        for part, arrays in before.items():
+            for name, array in arrays.items():
+                np.testing.assert_array_equal(after[part][name], array, strict=True)
+    given = {
+        (chunk.generation, chunk.ask)
+        for _, chunk, result in evaluator.recorded
+        if isinstance(chunk, TrainingChunk) and NOVELTY in result.outputs
+    }
+    explores = {
+        (generation, ask)
+        for generation in range(1, 13)
+        for ask in range(EMITTERS)
+        if block_mode(config.search, 0, generation, ask) == "explore"
+    }
+    assert given == explores
+    assert set(evaluator.arrays.values()) == {1}

@@ -19,6 +19,7 @@ from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.sections import NoveltyConfig
 from es_service.protocol.content import Policy
 from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.protocol.nearest import NOVELTY
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
     NO_CELL,
@@ -70,7 +71,8 @@ def novelty_search(
 
     def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
         objective = asked.objective or weighted(asked.fitness_weight)
-        return pair_weights(utilities(objective, population, state.archive, config.novelty, search.shaping))
+        known_P_S = population.outputs.get(NOVELTY)  # in the same archive: steps do not change it
+        return pair_weights(utilities(objective, population, state.archive, config.novelty, search.shaping, known_P_S))
 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
         return step_centre(state, asked, gradient_D, search)

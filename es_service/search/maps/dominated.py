@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.search.novelty import mean_smallest, squared_to
+from es_service.protocol.nearest import mean_smallest, squared_to
 
 BLOCK = 256
 """Policies whose distances are in memory together."""
