@@ -14,6 +14,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
+from es_service.protocol.episodes import in_blocks
 from es_service.protocol.machine import cpu_seconds, platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
@@ -46,6 +47,7 @@ class WorkerActor:
             cores: number of cores that it may use at a time.
         """
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
+        self._joins = cores > 1  # with one core, an item has few chunks
         self._task_code: tuple[str, ...] = ()
         self._of_all: Cores | None = None
         self._made: Made | None = None
@@ -127,7 +129,8 @@ class WorkerActor:
 
     def run(self, item: bytes, *arrays: bytes) -> bytes:
         """Run chunks; returns the pickled (results, its report or None, seconds of processors that its process and
-        those of its cores have used for this run so far), or None if it lacks arrays.
+        those of its cores have used for this run so far), or None if it lacks arrays. With several cores, the results
+        are joined by `in_blocks`.
 
         Args:
             item: pickled (arrays by name, origins, work) of a `Parcel`.
@@ -143,6 +146,8 @@ class WorkerActor:
                 return pickle.dumps(None)
             self._reports.note(results := self._made.run_chunks(work))
             seconds = self._seconds_so_far() - self._before_s
+            if self._joins:
+                results = in_blocks(results)
             return pickle.dumps((results, self._reports.report(), seconds), pickle.HIGHEST_PROTOCOL)
 
     def _seconds_so_far(self) -> float:

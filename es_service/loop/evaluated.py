@@ -134,11 +134,8 @@ def _resets(*address: Any) -> dict[str, Any]:
 def _told(generation: int, evaluated: Sequence[_Evaluated], spec: PolicySpec) -> tuple[CentreEvaluations, Named]:
     results = [episodes for _, episodes, _ in evaluated]
     episodes = joined(results) if len(results) > 1 else results[0]
-    of_each = [
-        {name: np.broadcast_to(column, len(rows.fitness)) for name, column in columns.items()}
-        for _, rows, columns in evaluated
-    ]
-    columns = {name: np.concatenate([of_one[name] for of_one in of_each]) for name in of_each[0]}
+    counts = [len(rows.fitness) for _, rows, _ in evaluated]
+    columns = {name: _column([of_one[name] for *_, of_one in evaluated], counts) for name in evaluated[0][2]}
     named = Named([subject for subject, *_ in evaluated], episodes.trace_T_B, spec)
     told = CentreEvaluations(
         generation,
@@ -153,6 +150,13 @@ def _told(generation: int, evaluated: Sequence[_Evaluated], spec: PolicySpec) ->
         columns,
     )
     return told, named
+
+
+def _column(values: Sequence[Any], counts: Sequence[int]) -> NDArray[Any]:
+    """One column of all rows; of some asks one number is that of all of their rows."""
+    if not any(map(np.ndim, values)):
+        return np.repeat(np.array(values), counts)
+    return np.concatenate([np.broadcast_to(column, count) for column, count in zip(values, counts, strict=True)])
 
 
 def evaluated_table(

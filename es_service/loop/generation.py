@@ -20,7 +20,7 @@ from es_service.errors import EvaluationError
 from es_service.loop.checks import require_columns, require_state
 from es_service.loop.contents import PolicyWork
 from es_service.loop.state import NO_BEST, Best, RunState, Search, statistics_in_force
-from es_service.protocol.episodes import Requests, gathered
+from es_service.protocol.episodes import Requests, gathered, moments_in
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
@@ -221,8 +221,7 @@ def episodes_of(
         asked: the chunks of each request, which have its index, and its leading axes as in `gathered`.
     """
     results = yield from _computed(EpisodesResult, [subject_chunk for work, _ in asked for subject_chunk in work])
-    moments = [result.moments for result in results if result.moments is not None]
-    return gathered([shape for _, shape in asked], results), moments
+    return gathered([shape for _, shape in asked], results), moments_in(results)
 
 
 def _computed(kind: type[AnyResult], work: Sequence[Work]) -> Requests[list[AnyResult]]:

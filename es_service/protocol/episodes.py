@@ -20,6 +20,8 @@ from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
     EvaluationChunk,
+    Moments,
+    MomentsOfChunks,
     Policies,
     PolicyChunk,
     Subject,
@@ -97,7 +99,7 @@ def _whole(shape: tuple[int, ...], parts: Sequence[EpisodesResult]) -> EpisodesR
     assert (row_N[order_N] == first + np.arange(math.prod(shape))).all(), "each row of a request comes once"
 
     def placed(*arrays: NDArray) -> NDArray:
-        flat = np.concatenate(arrays)
+        flat = np.concatenate(arrays) if len(arrays) > 1 else arrays[0]
         array = (flat if in_order else flat[order_N]).reshape(*shape, *flat.shape[1:])
         if len(shape) > 1 and POLICY_SLOTS < shape[0] < 2 * POLICY_SLOTS:
             # The episodes of a policy are not side by side, as in earlier versions: the bits of means depend on it.
@@ -143,6 +145,43 @@ def each(change: Callable[..., np.ndarray], *results: EpisodesResult, traces: bo
         outputs={name: change(*(result.outputs[name] for result in results)) for name in results[0].outputs},
         failures=tuple(text for result in results for text in result.failures),
     )
+
+
+def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
+    """Results of a work item as they travel: those of neighbouring training chunks of one request are one, since a
+    message with few arrays is read sooner. The moments stay those of each chunk, whose order decides about bits."""
+    blocks: list[ChunkResult] = []
+    for request, of_request in groupby(results, _request_of_block):
+        parts = list(of_request)
+        blocks += parts if request is None or len(parts) == 1 else [_block(parts)]
+    return blocks
+
+
+def _request_of_block(result: ChunkResult) -> int | None:
+    """Request of a training chunk without outputs of steps; None for other results, which stay as they are."""
+    is_of_training = isinstance(result, EpisodesResult) and isinstance(result.moments, Moments) and not result.of_steps
+    return result.request if is_of_training else None
+
+
+def _block(parts: Sequence[Any]) -> EpisodesResult:
+    moments = [part.moments for part in parts]
+    of_chunks = MomentsOfChunks(
+        np.array([each_moments.count for each_moments in moments]),
+        np.stack([each_moments.mean_O for each_moments in moments]),
+        np.stack([each_moments.m2_O for each_moments in moments]),
+    )
+    row_N = np.concatenate([part.row_N for part in parts])
+    rows = each(lambda *arrays: np.concatenate(arrays), *parts)
+    return replace(rows, moments=of_chunks, request=parts[0].request, row_N=row_N)
+
+
+def moments_in(results: Sequence[EpisodesResult]) -> list[Moments]:
+    """The moments of each chunk, in the order of the results."""
+    found: list[Moments] = []
+    for result in results:
+        found += result.moments.each() if isinstance(result.moments, MomentsOfChunks) else []
+        found += [result.moments] if isinstance(result.moments, Moments) else []
+    return found
 
 
 def joined(results: Sequence[EpisodesResult]) -> EpisodesResult:

@@ -350,9 +350,22 @@ class Moments:
 
 
 @dataclass(frozen=True)
+class MomentsOfChunks:
+    """Moments of several chunks C, as arrays."""
+
+    count_C: NDArray[np.float64]
+    mean_C_O: NDArray[np.float64]
+    m2_C_O: NDArray[np.float64]
+
+    def each(self) -> list[Moments]:
+        """Those of each chunk, in the order of the chunks."""
+        return [Moments(*of_chunk) for of_chunk in zip(self.count_C.tolist(), self.mean_C_O, self.m2_C_O, strict=True)]
+
+
+@dataclass(frozen=True)
 class EpisodesResult:
-    """Result of a training chunk, an evaluation chunk or a policy chunk: rows of a request. `episodes.gathered` makes
-    one of all rows of a request.
+    """Result of a training chunk, an evaluation chunk or a policy chunk: rows of a request. `episodes.in_blocks` makes
+    one of neighbouring training chunks, and `episodes.gathered` of all rows of a request.
 
     A training chunk's arrays have leading axes [P, S] and are over the member's episodes. The arrays of other chunks
     are of single episodes: [E] of the centre, or [L] of the policies in a chunk's slots.
@@ -369,7 +382,7 @@ class EpisodesResult:
     goal_distance: FloatArray
     """[..., 2]: mean distance to the goal at the end of the episodes, and least distance in any of them; NaN if the
     task has no goal."""
-    moments: Moments | None
+    moments: Moments | MomentsOfChunks | None
     """Moments of all observations that the policy acted on in valid episodes; None for evaluations, which do not update
     the observation statistics."""
     trace_T_B: FloatArray | None = None

@@ -30,7 +30,7 @@ from es_service.loop.budget import REACHED
 from es_service.loop.evaluated import policies_asked
 from es_service.loop.generation import initial_state, with_archive
 from es_service.loop.state import no_observations
-from es_service.protocol.episodes import addressed, each
+from es_service.protocol.episodes import addressed, each, in_blocks
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
@@ -221,6 +221,7 @@ class EchoActor(WorkerActor):
                 pass
             return [spec.answers[_kind(one)] for one in work]
 
+        self._joins = True  # as an actor with the cores of a node
         self._received, self._reports = Received(spec.parent_cache_bytes, Recipes.made), Reports(spec, self._cores)
         self._made = Made(Compilable(echo, lambda work: None), set())
         return platform_text({})
@@ -355,7 +356,8 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
                 driver_s += sent - began
                 next(session)
                 beside_s += time.perf_counter() - sent
-                results = [_for_chunk(next(replayed[_kind(subject_chunk)]), subject_chunk) for subject_chunk in work]
+                answered = [_for_chunk(next(replayed[_kind(subject_chunk)]), subject_chunk) for subject_chunk in work]
+                results = in_blocks(answered)
     driver_s, beside_s = map(float, np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0))
     return driver_s, beside_s
 

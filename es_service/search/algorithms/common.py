@@ -179,11 +179,12 @@ def step_centre(state: SearchState, asked: Ask, gradient_D: FloatArray, search: 
 def add_to_archive_and_map(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
     """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another; in a map
     of slots they compete at once."""
-    for evaluation in evaluations:
+    each = tuple(evaluations)  # which are made when a sequence of columns is asked for them
+    for evaluation in each:
         state = add_to_archive(state, evaluation)
     if (map_ := state.map) is not None and isinstance(map_.geometry, Dominated):
         return _compete(state, map_, evaluations)
-    for evaluation in evaluations:
+    for evaluation in each:
         state = insert_into_map(state, evaluation)
     return state
 
