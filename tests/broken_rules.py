@@ -215,6 +215,22 @@ CASES = [
         ("one of the newest", NOVELTY, "excluded_Q - (archive.size - newest), -1)", "0 * excluded_Q - 1, -1)"),
     ),
     *cases(
+        "novelty where the members are is that of the driver",
+        OF_NOVELTY,
+        (
+            "a tree over other entries",
+            NEAREST,
+            "before is not None and self._in_full_arrays == before._in_full_arrays else None",
+            "before is not None else None",
+        ),
+        (
+            "older entries than the newest",
+            NEAREST,
+            "np.concatenate(self.arrays)[self.first :]",
+            "np.concatenate(self.arrays)",
+        ),
+    ),
+    *cases(
         "phantom entries in the novelty archive",
         OF_NOVELTY,
         (

@@ -27,10 +27,11 @@ from es_service.errors import EvaluationError
 from es_service.loop.contents import no_statistics, policy_work
 from es_service.protocol.child import Child, socket_pair
 from es_service.protocol.messages import TrainingChunk, Work, with_subject
+from es_service.protocol.nearest import ROWS, archive_entries
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import IsoLine, Policies, Recipes, recipes_of
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.sent import Memory, Received, parcel
+from es_service.protocol.sent import LackingError, Memory, Received, parcel
 from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import centre, spec
 from workers import process
@@ -42,6 +43,7 @@ from workers.worker import Made
 PARENTS, WORKERS = 60, 2
 FAILING = 9
 """Number of an ask whose chunks raise an exception."""
+POINT = centre(np.arange(8, dtype=np.float32))
 LIMITS, SPEC = Limits(workers=WORKERS, max_attempts=1), spec()
 
 
@@ -235,6 +237,29 @@ def test_what_was_sent_with_an_item_that_failed_is_not_sent_again():
     assert [type(one) for one in heard] == [Placed, WorkerUp, Compiled, Failure, Answer]
     assert heard[-1].results == made(work)
     assert (len(transport.sent[0]) > 0, transport.sent[1]) == (True, [])
+
+
+def test_a_worker_says_that_it_lacks_entries_of_the_novelty_archive_and_is_sent_all_again():
+    """What it has of them stays while it is sent other work."""
+    places, sender, worker = np.random.default_rng(0).normal(size=(ROWS + 2, 2)), Memory(2**20, int), None
+
+    def sent(size):
+        entries = archive_entries(places[:size], None, 10, "euclidean")
+        arrays, origins, written = parcel([(replace(POINT, archive=entries), TrainingChunk(1, 0))], sender)
+        worker.add(arrays)
+        [(subject, _)] = worker.work(origins, written)
+        np.testing.assert_array_equal(subject.archive.descriptors, places[:size])
+        return [len(array) for array in arrays.values()]
+
+    worker = Received(2**20, Recipes.made)
+    assert sent(ROWS + 1) == [ROWS, 1]
+    worker.add(parcel([(POINT, TrainingChunk(1, 0))], sender).arrays)
+    assert sent(ROWS + 2) == [2]
+    worker = Received(2**20, Recipes.made)
+    with pytest.raises(LackingError):
+        sent(ROWS + 1)
+    sender.clear()
+    assert sent(ROWS + 2) == [ROWS, 2]
 
 
 def test_a_policy_alone_is_not_taken_for_a_centre_with_the_same_bits():
