@@ -22,6 +22,7 @@ from es_service.protocol.messages import (
     FloatArray,
     GradientChunk,
     Moments,
+    MomentsOfChunks,
     TrainingChunk,
     Work,
     WorkerSpec,
@@ -99,9 +100,9 @@ def results_of(spec: WorkerSpec, work: Sequence[Work], told: EpisodesResult) -> 
     return _with_moments(results, told.moments)
 
 
-def _with_moments(results: list[ChunkResult], moments: Moments | None) -> list[ChunkResult]:
+def _with_moments(results: list[ChunkResult], moments: Moments | MomentsOfChunks | None) -> list[ChunkResult]:
     """The results, of which the first one with moments has all of them, and the others have none."""
-    assert moments is not None, "moments of no observation are moments, too"
+    assert isinstance(moments, Moments), "moments of no observation are moments, too"
     for place, result in enumerate(results):
         if isinstance(result, EpisodesResult) and result.moments is not None:
             results[place] = replace(result, moments=moments)

@@ -159,8 +159,9 @@ def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
 
 def _request_of_block(result: ChunkResult) -> int | None:
     """Request of a training chunk without outputs of steps; None for other results, which stay as they are."""
-    is_of_training = isinstance(result, EpisodesResult) and isinstance(result.moments, Moments) and not result.of_steps
-    return result.request if is_of_training else None
+    if isinstance(result, EpisodesResult) and isinstance(result.moments, Moments) and not result.of_steps:
+        return result.request
+    return None
 
 
 def _block(parts: Sequence[Any]) -> EpisodesResult:

@@ -16,6 +16,8 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
+from numpy.typing import NDArray
+
 from es_service.protocol.content import Cache
 from es_service.protocol.messages import Centre, FloatArray, Subject, Work, recipes_in
 from es_service.protocol.nearest import ArchiveEntries
@@ -67,7 +69,7 @@ class Memory(Cache[bytes, Value]):
 class Parcel(NamedTuple):
     """A work item as it is sent."""
 
-    arrays: dict[bytes, FloatArray]
+    arrays: dict[bytes, NDArray[Any]]
     """Arrays that the worker lacks, by name; they are sent first."""
     origins: dict[bytes, Origin]
     """Of parents that it makes of these, and of what it has, one after another."""
@@ -81,7 +83,7 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
     Args:
         memory: sizes of what the worker has; now with what it is sent.
     """
-    needed: dict[bytes, FloatArray] = {}
+    needed: dict[bytes, NDArray[Any]] = {}
     origins_of: dict[bytes, Mapping[bytes, Origin]] = {}
     written: dict[int, Subject] = {}
     named_entries: dict[int, ArchiveEntries] = {}
@@ -103,7 +105,7 @@ def parcel(work: Sequence[Work], memory: Memory[int]) -> Parcel:
                 needed |= named
                 origins_of |= {name: {} for name in named}
             written[id(subject)] = replace(written[id(subject)], archive=named_entries[id(entries)])
-    arrays: dict[bytes, FloatArray] = {}
+    arrays: dict[bytes, NDArray[Any]] = {}
     origins: dict[bytes, Origin] = {}
     for name, array in needed.items():
         if name in memory:
@@ -160,12 +162,12 @@ class Received:
             most_bytes: as in `Memory`.
             made: `Recipes.made`, or its equal in bits.
         """
-        self.memory: Memory[FloatArray] = Memory(most_bytes, attrgetter("nbytes"))
+        self.memory: Memory[NDArray[Any]] = Memory(most_bytes, attrgetter("nbytes"))
         self._made = made
         self._archive: ArchiveEntries | None = None
         """The newest entries of the novelty archive, whose tree serves until there are more."""
 
-    def add(self, arrays: Mapping[bytes, FloatArray]) -> None:
+    def add(self, arrays: Mapping[bytes, NDArray[Any]]) -> None:
         """Take arrays, which come before the item that needs them."""
         for name, array in arrays.items():
             self.memory.add(name, array)
