@@ -144,8 +144,7 @@ def read(path: Path = RESULTS) -> pd.DataFrame:
     """A table of results, without rows if there is no file."""
     if not path.exists():
         return pd.DataFrame(columns=RUN)
-    table = pd.read_csv(path)
-    return table.assign(settings=table.settings.fillna(""))
+    return pd.read_csv(path, converters={"settings": str})
 
 
 def keep(rows: pd.DataFrame) -> bool:
