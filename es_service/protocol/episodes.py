@@ -99,7 +99,7 @@ def _whole(shape: tuple[int, ...], parts: Sequence[EpisodesResult]) -> EpisodesR
     assert (row_N[order_N] == first + np.arange(math.prod(shape))).all(), "each row of a request comes once"
 
     def placed(*arrays: NDArray) -> NDArray:
-        flat = np.concatenate(arrays) if len(arrays) > 1 else arrays[0]
+        flat = arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
         array = (flat if in_order else flat[order_N]).reshape(*shape, *flat.shape[1:])
         if len(shape) > 1 and POLICY_SLOTS < shape[0] < 2 * POLICY_SLOTS:
             # The episodes of a policy are not side by side, as in earlier versions: the bits of means depend on it.

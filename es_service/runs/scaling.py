@@ -273,7 +273,7 @@ def _for_chunk(answer: ChunkResult, work: Work) -> ChunkResult:
     cut = each(lambda array: array[: len(row_N)], answer, traces=False)
     outputs = {name: array for name, array in cut.outputs.items() if name != NOVELTY}
     if isinstance(subject, Centre) and subject.archive is not None:
-        outputs[NOVELTY] = np.float64(cut.fitness)
+        outputs[NOVELTY] = cut.fitness.astype(np.float64)
     return addressed(work, replace(cut, moments=answer.moments, trace_T_B=trace_T_B, outputs=outputs))
 
 
