@@ -1,12 +1,14 @@
 """Descriptions of tasks by name, for the driver.
 
 Shipped tasks are in a table. All others are described by a child process, because this imports JAX and Brax, or code of
-the user; a task is described again only if its code has changed.
+the user; a task is described again only if its code has changed. What libraries define is remembered on disk, since to
+describe MuJoCo's robots takes a quarter of a minute.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -23,6 +25,7 @@ from es_service.config.text import in_line, nearest, one_of, problem_of, show, w
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.child import END_S, Child, NoAnswerError
 from es_service.protocol.episodes import CHOSEN_METRIC
+from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import NO_CHOICES, UNBOUNDED, HostChoices, TaskSpec, with_options
 from es_service.protocol.options import (
     FREE,
@@ -38,10 +41,11 @@ from es_service.protocol.options import (
 )
 from es_service.protocol.process_environment import child_environment, require_no_import_of_a_task
 from es_service.protocol.rollouts import Rollouts
-from es_service.protocol.sources import SUITES, task_code, user_sources
+from es_service.protocol.sources import SUITES, task_code, user_sources, worker_sources
 from es_service.protocol.user_code import RaisedError
 from workers import environments
 from workers.rollouts import BACKENDS
+from workers.simd.backend import cache as kernels
 
 CALLER = "caller"
 """Name of the task, and its kind."""
@@ -90,6 +94,9 @@ OTHER_TASKS = (
 DESCRIBE_S = 300.0
 """Longest wait for a description, in seconds: for the first time, to see whether simd can compile a humanoid of MuJoCo
 takes a minute of a processor, and longer on a busy machine."""
+REMEMBERED = ("brax", "mujoco", *SUITES)
+"""Kinds of tasks that libraries define as pure functions: their descriptions depend on versions, this project's code
+and what the config chooses, and are kept in the cache of kernels."""
 REPEATS_S = 20.0
 """Longest time of a trial whether it repeats itself."""
 
@@ -181,6 +188,20 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
     Args:
         settings: what a config chooses for it, as JSON.
     """
+    folder, key = kernels.cache_folder(), ""
+    if name.partition(":")[0] in REMEMBERED and folder is not None and kernels.trusted(folder):
+        depends_on = [name, settings, code, worker_sources(), platform_info()]
+        key = hashlib.sha256(json.dumps(depends_on, sort_keys=True).encode()).hexdigest()
+        if (remembered := kernels.load(folder, key)) is not None:
+            return task_from_fields(json.loads(remembered))
+    fields = _ask_for_description(name, settings)
+    if key and folder is not None:
+        kernels.save(folder, key, json.dumps(fields).encode())
+    return task_from_fields(fields)
+
+
+def _ask_for_description(name: str, settings: str) -> dict[str, Any]:
+    """The fields of a TaskSpec, found by a child process; arguments as of `_described`."""
     with Child("workers.describe:descriptions", child_environment()) as child:
         try:
             child.call(name, json.loads(settings), limit_s=DESCRIBE_S)
@@ -197,7 +218,7 @@ def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> T
         problem = answer["problem"]
         named = re.match(r"(task\.(?:\w+|options\.\w+)) = ", problem)
         raise ConfigError(problem, field=named and named[1])
-    return task_from_fields(answer["task"])
+    return answer["task"]
 
 
 def tasks_of_suite(suite: str) -> Iterator[tuple[str, TaskSpec | str]]:
