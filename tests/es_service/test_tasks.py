@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from es_service.cli.bench import bench_rollouts
+from es_service.config import tasks
 from es_service.config.tasks import TASKS, task_of
 from es_service.config.workload import config_warnings
 from es_service.dispatch.events import Limits
@@ -21,7 +25,7 @@ from tests.es_service.config_examples import load_config
 from tests.examples.beam import beam
 from tests.helpers import SPEC, centre, random_parameters
 from workers.describe import does_not_repeat
-from workers.environments import TaskError, describe_environment, make_environment
+from workers.environments import SHIPPED, TaskError, describe_environment, make_environment
 from workers.rollouts import BACKENDS
 
 HERE = __name__
@@ -374,3 +378,31 @@ def test_what_is_defined_in_a_notebook_belongs_into_a_file(key, known):
         with pytest.raises(ConfigError, match=told) as caught:
             load_config({section: {name: given}}, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
         assert caught.value.problems[0].field == key
+
+
+def test_what_a_library_defines_is_described_once_for_all_processes(tmp_path, monkeypatch):
+    """Until the code or a version changes; what users define is asked for in each process."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    asked: list[str] = []
+    fields = json.loads(json.dumps(dataclasses.asdict(SHIPPED["ant_trap"])))
+    monkeypatch.setattr(tasks, "_ask_for_description", lambda name, settings: asked.append(name) or fields)
+
+    def described(*names: str) -> list[str]:
+        """Names of the tasks that a process asks for which looks these up."""
+        tasks._described.cache_clear()
+        asked.clear()
+        assert all(TASKS[name] == SHIPPED["ant_trap"] for name in names)
+        return asked
+
+    try:
+        libraries, users = ["brax:ant", "mujoco:Ant-v5"], [f"{HERE}:Named", f"python:{HERE}:Plain"]
+        assert described(*libraries, *users) == [*libraries, *users]
+        assert described(*libraries, *users) == users
+        entry = next((tmp_path / "es-service" / "kernels").iterdir())
+        entry.write_bytes(entry.read_bytes()[:-1])
+        assert len(described(*libraries)) == 1
+        monkeypatch.setattr(tasks, "worker_sources", lambda: {"workers/other.py": "0"})
+        assert described(*libraries) == libraries
+        assert described(*libraries) == []
+    finally:
+        tasks._described.cache_clear()
