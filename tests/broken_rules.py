@@ -172,7 +172,7 @@ XLA, SIMD = "workers/xla.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
 LOW_RANK = "es_service/protocol/policy_spec.py"
 LOW_RANK_OF_KERNELS = "workers/simd/episodes/low_rank.py"
-LOW_RANK_OF_XLA = "workers/policies/pairs.py"
+LOW_RANK_OF_XLA = "workers/xla.py"
 NOISE_OF_KERNELS = "workers/simd/episodes/noise_kernels.py"
 
 OF_NOVELTY, OF_NOVELTY_SEARCH = "tests/es_service/test_novelty.py", "tests/laws/test_novelty_search.py"

@@ -21,7 +21,7 @@ from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
-from es_service.runs.identity import code_changes
+from es_service.runs.checked_config import code_changes
 from es_service.runs.run_status import invalid_members, objectives, population_size, state, weights
 from es_service.runs.selection import RankedBy
 from es_service.search.algorithms import known_settings

@@ -40,10 +40,10 @@ from es_service.runs.certified import (
     resets_of,
     stored,
 )
+from es_service.runs.checked_config import code_of
 from es_service.runs.engine import engine_here
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
-from es_service.runs.identity import code_of
 from es_service.runs.other_task import FIRST_OBSERVATION, OtherTask, elsewhere_of, other_task
 from es_service.runs.selection import RANKED_BY, RankedBy, halved, kept, results_of
 from es_service.runs.session import show_notice

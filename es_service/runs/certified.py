@@ -109,7 +109,7 @@ class Certified:
     tries: int
     """Number of this decision, from 1, or of those until the run was over; 0 if no decision belongs to it."""
     platform: Mapping[str, Any]
-    """Packages, processor and code that computed it; see `runs.identity.changes_since`."""
+    """Packages, processor and code that computed it; see `runs.checked_config.changes_since`."""
     episodes: StoredEpisodes
     policy: Policy
     elsewhere: Elsewhere | None = None

@@ -25,9 +25,8 @@ from es_service.protocol.messages import FloatArray
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.protocol.user_code import RaisedError
 from es_service.runs.certified import newest_certified
-from es_service.runs.checked_config import changed_config
+from es_service.runs.checked_config import changed_config, changes_since, code_of
 from es_service.runs.evaluation import Candidate, candidates, centre_of
-from es_service.runs.identity import changes_since, code_of
 from es_service.runs.view import Run
 from es_service.runs.worker_count import GPU
 from es_service.store import reader

@@ -32,8 +32,8 @@ from es_service.loop.state import Observer, Stop, no_observations
 from es_service.protocol.episodes import METRIC_FORM, DispatchCounts, OverlappedRequests, wrong_metric_names
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
+from es_service.runs.checked_config import Recorder, code_of, tell_of_other_code
 from es_service.runs.engine import make_engine, reader_of_reports
-from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.snapshot import require_sound_state
 from es_service.runs.view import Run, open_run

@@ -28,9 +28,9 @@ from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.user_code import RaisedError
 from es_service.runs.certification import platform_of, workers_for
 from es_service.runs.certified import Certified, Elsewhere, all_certifications, arrays_of
+from es_service.runs.checked_config import changes_since, code_of
 from es_service.runs.engine import engine_here
 from es_service.runs.evaluation import evaluation_config
-from es_service.runs.identity import changes_since, code_of
 from es_service.runs.other_task import stored_task
 from es_service.runs.selection import StoredEpisodes, new_episodes
 from es_service.runs.session import initial_centres, initial_statistics

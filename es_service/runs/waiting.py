@@ -19,7 +19,7 @@ from typing import TypeVar
 from es_service.errors import ConfigError, DatabaseHeldError, Interrupted, StoreError, WayOut
 from es_service.loop.state import Generation
 from es_service.protocol.content import Arrays
-from es_service.runs.identity import Recorder
+from es_service.runs.checked_config import Recorder
 from es_service.store.folder import DATABASE
 from es_service.store.writer import RunStore
 

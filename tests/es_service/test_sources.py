@@ -32,7 +32,7 @@ from es_service.protocol.sources import (
     why_refused,
     worker_sources,
 )
-from es_service.runs.identity import code_of, require_unchanged, tell_of_other_code
+from es_service.runs.checked_config import code_of, require_unchanged, tell_of_other_code
 from tests.helpers import SPEC, centre, random_parameters
 from workers.actor import WorkerActor
 

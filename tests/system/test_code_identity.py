@@ -234,11 +234,11 @@ def test_a_run_without_a_record_of_its_code_goes_on_and_has_one_from_then_on(sma
 
 
 def test_strict_also_refuses_other_packages(small, monkeypatch):
-    from es_service.runs import identity, session
+    from es_service.runs import checked_config, session
 
     _, resume = small
-    other = {**identity.platform_info(), "jax": "99.0"}
-    for module in (identity, session):
+    other = {**checked_config.platform_info(), "jax": "99.0"}
+    for module in (checked_config, session):
         monkeypatch.setattr(module, "platform_info", lambda: other)
     with pytest.raises(ConfigError, match=r"jax [0-9.]+ -> 99\.0"):
         resume(31, strict=True)

@@ -12,10 +12,9 @@ from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from tests import helpers
 from workers.environments import make_environment
-from workers.policies.pairs import act_in_pairs
 from workers.policies.policy import act, initial_memory, initial_parameters, split_layers
 from workers.worker import episode_keys
-from workers.xla import make_training_rollout
+from workers.xla import act_in_pairs, make_training_rollout
 
 PAIRS, UNIT = 3, np.float32(0.05 / NORMAL_STD)
 

@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 
 from workers.environments import make_environment
-from workers.scatters import without_scatters
+from workers.rollouts.jax_tasks import without_scatters
 
 IDS = np.array([2, 0, -1, 2, 3, 9, 0])
 """Rows of three: with one twice, and with those that JAX drops (in `segment_sum` also -1)."""

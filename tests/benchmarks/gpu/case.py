@@ -28,7 +28,7 @@ from tests.benchmarks.gpu.policies import WAYS, Way
 from workers import environments
 from workers.episode import episode_steps
 from workers.policies.policy import initial_parameters
-from workers.scatters import without_scatters
+from workers.rollouts.jax_tasks import without_scatters
 from workers.worker import episode_keys
 from workers.xla import make_training_rollout
 
