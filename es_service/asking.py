@@ -47,7 +47,6 @@ from workers.asked_rows import Rows, gradients, results_of, rows_of
 from workers.policies.policy import LanePolicies
 
 MOST_STEPS = 2**31 - 1
-"""Most environment steps of an episode."""
 LEFT = "the block of ask_tell was left; make the same call again to go on"
 
 

@@ -39,9 +39,7 @@ class Problem:
     field: str | None = None
     """Dotted key of the config."""
     value: Any = None
-    """The value given."""
     allowed: str | None = None
-    """The allowed values, in words."""
     suggestion: Any = None
     """The name or value that was probably meant."""
 

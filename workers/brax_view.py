@@ -65,7 +65,7 @@ class TaskBraxEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """The state after an action [A]."""
-        carry, seen = self._functions.step(_carry(state), action)
+        carry, seen = self._functions.step(state.pipeline_state, action)
         return replace(
             state,
             pipeline_state=cast(Any, carry),
@@ -141,10 +141,6 @@ def wrap(env: Env, episode_length: int = 1000, action_repeat: int = 1, randomiza
     if randomization_fn is not None:
         raise ValueError("randomization_fn must be None: the tasks have no brax.System whose constants it could change")
     return RandomResets(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
-
-
-def _carry(state: State) -> Any:
-    return state.pipeline_state
 
 
 def _split(keys_N: jax.Array) -> tuple[jax.Array, jax.Array]:

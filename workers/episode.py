@@ -27,11 +27,9 @@ from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
 
 class EpisodeStep(NamedTuple):
     before: Any
-    """State of the environment before the step."""
     action_A: Any
     """Action as the environment gets it, with its noise."""
     state: Any
-    """State after the step."""
     reward: Any
     done: Any
 
@@ -107,7 +105,6 @@ OUTPUTS: Mapping[str, EpisodeOutput] = {
     ),
     "step_descriptor": _of_state(lambda environment, state: jnp.asarray(environment.descriptor(state), jnp.float32)),
 }
-"""All outputs by name."""
 assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/episodes.py has its functions here"
 
 

@@ -83,7 +83,6 @@ def shared_rows(cores: int) -> str:
 
 
 def use_row(file: str, core: int) -> None:
-    """Take the row of a core as that of this process."""
     global _own
     with open(file, "r+b") as opened:
         _own = _row(mmap.mmap(opened.fileno(), 0), core)

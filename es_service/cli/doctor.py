@@ -152,7 +152,6 @@ def _rollout() -> Iterator[Finding]:
 
 
 SECONDS = 1.0
-"""Duration of the measurement."""
 NEW_OBJECTS = "new_objects"
 """Setting of `settings_of_description`."""
 FAR_FROM_C = 1e-3

@@ -56,8 +56,7 @@ from es_service.runs.run_status import (
 )
 from es_service.runs.view import open_run
 from es_service.search.algorithms import ALGORITHMS, OURS
-from es_service.store import digest
-from es_service.store.digest import digest_of
+from es_service.store.digest import checked_parts, digest_of
 
 
 def status_data(status: RunStatus) -> dict[str, Any]:
@@ -86,10 +85,6 @@ def status_data(status: RunStatus) -> dict[str, Any]:
             "problem": recent.problem,
         },
     }
-
-
-def digest_data(parts: Mapping[str, str], *, mixed: bool) -> dict[str, Any]:
-    return {"digest": digest_of(parts), "mixed": mixed, "parts": dict(parts)}
 
 
 def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
@@ -165,13 +160,14 @@ def digest_(
     single = is_single(folders)
 
     def show(folder: Path) -> dict[str, Any]:
-        part_digests, mixed = digest.checked_parts(folder)
+        part_digests, mixed = checked_parts(folder)
+        whole = digest_of(part_digests)
         if not as_json:
             for name, value in part_digests.items() if parts else ():
                 print(f"{value}  {name}")
             where = "" if single else f"  {folder}"
-            print(f"{digest.digest_of(part_digests)}{where}{'  mixed' if mixed else ''}", flush=True)
-        return ({} if single else {"run": str(folder)}) | digest_data(part_digests, mixed=mixed)
+            print(f"{whole}{where}{'  mixed' if mixed else ''}", flush=True)
+        return {**({} if single else {"run": str(folder)}), "digest": whole, "mixed": mixed, "parts": part_digests}
 
     problems: list[dict[str, str]] = []
     results = show(folders[0]) if single else [data for _, data in readable(of_each(folders, show), problems)]

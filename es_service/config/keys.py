@@ -27,7 +27,6 @@ SECTIONS = {
     for name, field in RunConfig.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
 }
-"""Name -> class of each section."""
 FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name not in SECTIONS} | {
     f"{section}.{name}": field
     for section, model in {**SECTIONS, RESOURCES.removesuffix("."): WorkerResources}.items()

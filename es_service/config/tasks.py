@@ -34,7 +34,6 @@ from es_service.protocol.options import (
     ParameterSpec,
     allowed_text,
     allowed_value,
-    choice,
     defaults_of,
     is_plain,
     option_values,
@@ -252,9 +251,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
 
     Fields that only older versions had are left out.
     """
-    options = fields.get("options", {})
-    of_lists = {name: choice(*stored) for name, stored in options.items() if isinstance(stored, list)}  # up to 0.11
-    return _TASK.validate_python({**fields, "options": {**options, **of_lists}})
+    return _TASK.validate_python(fields)
 
 
 def settings_of_task(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -85,7 +85,8 @@ ANY_NUMBER = 2**20
 def chunks_of_phases(config: RunConfig) -> dict[str, int]:
     """Number of chunks of each phase of a generation, all of which can be computed at the same time."""
     search, sizes, several = config.search, config.compute, config.search.populations()
-    together = _episodes_together(config)
+    rollout = ROLLOUTS.get(sizes.rollout)  # some send fewer episodes together than a chunk has
+    together = None if rollout is None else rollout.episodes_together(config.made.task)
     if not isinstance(search, PopulationConfig):
         policies, episodes = search.policies(), search.evaluation_episodes
         return {"rollout": chunks_of(policies, episodes) if together is None else -(-policies * episodes // together)}
@@ -94,12 +95,6 @@ def chunks_of_phases(config: RunConfig) -> dict[str, int]:
         "gradient": several * -(-search.pairs // sizes.gradient_block_pairs),
         "evaluation": several * -(-search.evaluation_episodes // (together or EVALUATION_EPISODES_PER_CHUNK)),
     }
-
-
-def _episodes_together(config: RunConfig) -> int | None:
-    """Most episodes that are sent to a worker together; None: those of whole chunks."""
-    task, rollout = config.made.task, ROLLOUTS.get(config.compute.rollout)
-    return None if rollout is None else rollout.episodes_together(task)
 
 
 def chunks_at_once(config: RunConfig) -> int:

@@ -57,7 +57,6 @@ def names_in(arrays: Arrays) -> frozenset[bytes]:
 
 
 def as_bytes(name_N: NDArray[Any]) -> list[bytes]:
-    """The names of an array of names, as bytes."""
     return name_N.reshape(-1).tolist()
 
 
@@ -69,7 +68,6 @@ class Policy:
     """
 
     spec: PolicySpec
-    """What its network is."""
     parameters_D: NDArray[np.float32] = field(repr=False)
     observation_mean_O: NDArray[np.float32] = field(repr=False)
     observation_std_O: NDArray[np.float32] = field(repr=False)

@@ -195,7 +195,6 @@ def is_mixed(platforms: Iterable[Mapping[str, Any]]) -> bool:
 
 
 def without_code(platform: Mapping[str, Any]) -> dict[str, Any]:
-    """A recorded platform without the hashes of the code."""
     return {name: value for name, value in platform.items() if name != CODE}
 
 

@@ -306,7 +306,6 @@ def recipes_in(subject: Subject) -> Recipes | None:
 
 
 def with_subject(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
-    """The chunks, each with the same subject."""
     return [(subject, chunk) for chunk in chunks]
 
 

@@ -259,7 +259,6 @@ class Policies:
     first: int
     """Number of the first of them among the policies of their ask."""
     episodes: int
-    """Episodes of each policy."""
     seed: int
     """Seed of the resets. In a run it is the seed of the run."""
     traces: bool

@@ -32,7 +32,6 @@ class RecordRequest:
 
     @property
     def reset_key(self) -> Keys:
-        """Key of the stream of its reset."""
         return evaluation_reset_keys(
             self.seed, self.centre.generation, self.episode, self.ask, self.policy, self.domain
         )
@@ -49,7 +48,6 @@ class Mesh(NamedTuple):
     vertices_V_3: FloatArray
     """In the frame of a shape, in metres."""
     triangles_F_3: NDArray[np.int32]
-    """The vertices of each triangle."""
 
 
 class Shape(NamedTuple):

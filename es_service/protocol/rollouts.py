@@ -30,7 +30,6 @@ class Rollout(Protocol):
     name: str
     """The value of `compute.rollout`."""
     task_kinds: tuple[TaskKind, ...] = ("jax",)
-    """Kinds of tasks that it can compute."""
     runs_in_threads: bool = False
     """Whether threads of one process compute side by side, without the interpreter's lock. If not, each core has a
     process."""

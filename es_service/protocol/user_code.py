@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from threading import RLock
-from types import FrameType, ModuleType
+from types import ModuleType
 
 from es_service.protocol.machine import process_start_s
 from es_service.protocol.sources import OURS, SHARED_FOLDERS, UserModule, modules_of, sha256, user_path
@@ -224,7 +224,11 @@ def _is_ours(error: BaseException) -> bool:
 
 def _frames(error: BaseException, packages: set[str]) -> list[str]:
     """The frames of an exception in the user's files, as lines; of a syntax error, its place in such a file."""
-    chosen = (place for place in traceback.walk_tb(error.__traceback__) if _is_users(place[0], packages))
+    chosen = (
+        (frame, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in packages or is_users_file(frame.f_code.co_filename)
+    )
     lines = "".join(traceback.StackSummary.extract(chosen).format()).splitlines()
     if isinstance(error, SyntaxError) and error.filename and not str(error.filename).startswith(_HIDDEN):
         *place, _ = traceback.format_exception_only(error)
@@ -235,9 +239,3 @@ def _frames(error: BaseException, packages: set[str]) -> list[str]:
 def is_users_file(file: str) -> bool:
     """Whether a file is neither of this project nor of a library, by its name."""
     return not file.startswith(_HIDDEN) and not set(Path(file).parts) & set(SHARED_FOLDERS)
-
-
-def _is_users(frame: FrameType, packages: set[str]) -> bool:
-    if str(frame.f_globals.get("__name__")).partition(".")[0] in packages:
-        return True
-    return is_users_file(frame.f_code.co_filename)

@@ -78,7 +78,6 @@ class RunData:
 
     @property
     def name(self) -> str:
-        """Name of the run's folder."""
         return self.folder.absolute().name
 
     @property
@@ -88,7 +87,6 @@ class RunData:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the descriptor's dimensions."""
         return tuple(self.meta.task["descriptor_names"])
 
     @property

@@ -268,17 +268,13 @@ def path_lines(data: RunData) -> dict[str, Any]:
             if (detours_at := detours(inside_T_B, data.task, map_.geometry.bounds))
         }
         return script_data | {"points": points, "paths": packed(TENTHS * lines, "int16")}
-    time, shown = _path_frame(data), min(len(data.names), PAIRED_DIMENSIONS)
+    steps, shown = float(data.constants["task.episode_steps"]), min(len(data.names), PAIRED_DIMENSIONS)
+    time = Frame((0.0, steps), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48)
     low_B, high_B = np.array(data.bounds).T
     share = np.clip((path_N_T_B - low_B) / (high_B - low_B), -0.02, 1.02)[..., :shown]
     x = np.broadcast_to(time.across(np.linspace(*time.x, points))[:, None], share.shape)
     lines = np.stack([x, time.down(share)], axis=-1).transpose(0, 2, 1, 3)
     return script_data | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}
-
-
-def _path_frame(data: RunData) -> Frame:
-    steps = float(data.constants["task.episode_steps"])
-    return Frame((0.0, steps), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48)
 
 
 def path_figure(data: RunData) -> Markup:

@@ -95,7 +95,8 @@ def measures(runs: Sequence[RunData]) -> dict[str, Measure]:
     of_both = (ELSEWHERE, GAP_ELSEWHERE), METRIC
     elsewhere, own = ([column for column in runs[0].history if column.startswith(one)] for one in of_both)
     names = [CERTIFIED, SUCCESS, *elsewhere, *(name for name in MEASURES if name not in (CERTIFIED, SUCCESS)), *own]
-    return {name: measure_named(name) for name in names if all(has_values(run, name) for run in runs)}
+    has_values = [{name for name, values in run.history.items() if np.isfinite(values).any()} for run in runs]
+    return {name: measure_named(name) for name in names if all(name in known for known in has_values)}
 
 
 def chosen(runs: Sequence[RunData], names: Sequence[str]) -> dict[str, Measure]:
@@ -112,10 +113,6 @@ def has_curve(runs: Sequence[RunData], column: str) -> bool:
     if column == GAP or column.startswith((CERTIFIED, GAP_ELSEWHERE)):
         return column.startswith(CERTIFIED) and all(np.isfinite(run.history[column][:-1]).any() for run in runs)
     return True
-
-
-def has_values(run: RunData, column: str) -> bool:
-    return bool(np.isfinite(run.history.get(column, np.zeros(0))).any())
 
 
 def with_derived(history: HistoryColumns, certified: Sequence[Mapping[str, Any]], fitness: str) -> HistoryColumns:

@@ -114,7 +114,6 @@ def run_page(data: RunData, evaluate: EvaluateText, replays: Mapping[str, Any] |
 
 
 def run_title(data: RunData) -> str:
-    """Name of a run, its search and its task."""
     return f"{data.name}: {data.constants['search.algorithm']} on {data.constants['task.environment']}"
 
 
@@ -157,12 +156,10 @@ def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], lib
 
 
 def asset(name: str, package: str = "es_service.report") -> str:
-    """Text of a file of a package's `assets`."""
     return (resources.files(package) / "assets" / name).read_text(encoding="utf-8")
 
 
 def section(title: str, *content: object, id_: str) -> Markup:
-    """A part of the page with a heading."""
     return tag("section", tag("h2", title), *content, id=id_)
 
 

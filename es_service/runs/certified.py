@@ -213,7 +213,6 @@ class CertifiedValue(NamedTuple):
 
     policy: Certified
     episodes: StoredEpisodes
-    """Its certification episodes in this task."""
 
 
 def certified_by_task(folder: Path) -> dict[str, CertifiedValue]:

@@ -78,12 +78,10 @@ class Fresh:
 
     @property
     def episodes(self) -> int:
-        """Number of fresh episodes."""
         return int(self.fitness.count)
 
     @property
     def mean(self) -> float:
-        """Mean fitness over the fresh episodes."""
         return float(self.fitness.mean_O)
 
     @property

@@ -35,7 +35,6 @@ from es_service.runs.session import initial_policy
 
 _LOG = logger(__name__)
 LARGEST = 2**63 - 1
-"""Largest seed and generation."""
 
 
 @dataclass(frozen=True)

@@ -323,4 +323,3 @@ FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
     "ribs": _ribs,
     "tensorboard": _tensorboard,
 }
-"""Function that writes each format."""

@@ -134,7 +134,6 @@ def stop(job: str, address: str) -> str:
 
 
 def _client(address: str) -> Any:
-    """Ray's client for jobs."""
     if not address.startswith(("http://", "https://")):
         url = f"http://{_host(address)}:8265"
         raise ConfigError(
@@ -204,7 +203,6 @@ class JobPackage:
     out: str
     """Folder of the run or of the sweep, as the cluster's head sees it."""
     config: str
-    """Text of the config file."""
     files: Mapping[str, Path]
     """Place in the job's folder -> source file of a user's module, in alphabetical order."""
     expected: tuple[str, ...]

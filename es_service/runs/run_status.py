@@ -217,18 +217,14 @@ def runs_of(folder: Path) -> list[Path]:
     """
     if holds_run(folder):
         return [folder]
-    return sorted(_inside(folder), key=lambda run: _in_order(run.name)) or [folder]
+    found = runs_inside(folder) | {folder / file.stem for file in (folder / INSIDE).glob("*.yaml")}
+    return sorted(found, key=lambda run: _in_order(run.name)) or [folder]
 
 
 def output_of(run: Path) -> Path | None:
     """The file with what the process of a sweep's run has printed; None if there is none."""
     log = run.parent / INSIDE / f"{run.name}.log"
     return log if log.is_file() else None
-
-
-def _inside(folder: Path) -> set[Path]:
-    """Folders of the runs directly inside a folder, and those for which a sweep has a config."""
-    return runs_inside(folder) | {folder / file.stem for file in (folder / INSIDE).glob("*.yaml")}
 
 
 def _in_order(name: str) -> list[str | float]:

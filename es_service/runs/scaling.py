@@ -316,7 +316,8 @@ def _search(config: RunConfig) -> driver.Search:
 
 def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple[float, float]:
     """Seconds of a generation in which only the driver works, and those that it and the store need beside rollouts."""
-    config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
+    budget = config.budget.model_copy(update={**dict.fromkeys(REACHED), "generations": GENERATIONS})
+    config = config.model_copy(update={"budget": budget})
     search = _search(config)
     task = search.task
     random, bounds_B_2 = np.random.default_rng(0), _bounds(task)
@@ -360,7 +361,3 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> tuple
                 results = in_blocks(answered)
     driver_s, beside_s = map(float, np.median(np.diff(times, axis=0)[GENERATIONS // 3 :], axis=0))
     return driver_s, beside_s
-
-
-def _budget() -> dict[str, Any]:
-    return {**dict.fromkeys(REACHED), "generations": GENERATIONS}

@@ -34,7 +34,6 @@ class StoredEpisodes:
     """What is kept of episodes of a policy, whatever the run's `task.fitness` is."""
 
     return_E: NDArray[np.float64]
-    """Sum of the rewards."""
     last_reward_E: NDArray[np.float64]
     """Reward of the last valid step."""
     goal_distance_E: NDArray[np.float64]
@@ -91,7 +90,6 @@ class SelectionRecord:
 
     @property
     def count(self) -> int:
-        """Number of its selection episodes."""
         return sum(episodes.count for episodes in self.rounds)
 
     def mean(self, by: RankedBy) -> float:

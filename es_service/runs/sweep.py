@@ -103,7 +103,8 @@ class RunCommands:
             row is not None and any(row.get(key, -math.inf) >= at for key, at in limits.items())
         ):
             return self.certify
-        return [*self.run, *(f"--set=budget.{key}={_written(key, at)}" for key, at in limits.items())]
+        whole = {key: math.ceil(at) if key == "env_steps" else at for key, at in limits.items()}  # steps are whole
+        return [*self.run, *(f"--set=budget.{key}={at}" for key, at in whole.items())]
 
 
 def command_of(
@@ -126,11 +127,6 @@ def command_of(
         ["evaluate", str(run.folder), "--certify", *share],
         certifying,
     )
-
-
-def _written(key: str, at: float) -> int | float:
-    """A limit as a value of a config, in which environment steps are whole."""
-    return math.ceil(at) if key == "env_steps" else at
 
 
 def _certified_costs(folder: Path) -> dict[str, list[float]]:
@@ -169,7 +165,6 @@ def newest(folder: Path) -> Row | None:
 
 _LOG = logger(__name__)
 COMMANDS = "es_service.cli.in_turn"
-"""Module of the processes."""
 POLL_S = 0.1
 ROWS_S = 1.0
 """Seconds between two readings of the newest generation of each run."""

@@ -51,9 +51,7 @@ class Tracker(Protocol):
         """Add history rows, whose generations are all newer than `newest`, in their order."""
         ...
 
-    def close(self) -> None:
-        """Finish all writing."""
-        ...
+    def close(self) -> None: ...
 
 
 def check_trackers(names: Sequence[str]) -> None:

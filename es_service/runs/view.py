@@ -88,8 +88,9 @@ class Run:
         if not self.config_file.exists():
             return self.config
         recorded = read_yaml_file(self.config_file)
-        budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
-        store = recorded.get("store", self.config.get("store", {}))  # runs of older versions have no such section
+        budget, compute, store = (
+            recorded.get(section, self.config[section]) for section in ("budget", "compute", "store")
+        )
         if isinstance(compute, Mapping):
             compute = {**compute, **{key: self.config["compute"][key] for key in COMPUTE_CONSTANTS}}
         return self.config | {"budget": budget, "compute": compute, "store": store}
@@ -252,7 +253,6 @@ class Run:
 
     @property
     def descriptor_names(self) -> list[str]:
-        """Names of the descriptor's dimensions, in order."""
         return descriptor_names(self.meta)
 
     @property

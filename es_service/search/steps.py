@@ -89,11 +89,7 @@ SPEED = 4.0 / 3.0
 
 
 def fresh_clipup(parameters: int) -> dict[str, np.ndarray]:
-    """The state before any step: a velocity of 0.
-
-    Args:
-        parameters: D, the number of policy parameters.
-    """
+    """The state before any step: a velocity of 0; argument as of `fresh_adam`."""
     return {"velocity_D": np.zeros(parameters, np.float32)}
 
 
@@ -125,11 +121,6 @@ def norm(x_D: np.ndarray) -> float:
     return math.sqrt(float(np.sum(np.square(x_D, dtype=np.float64))))
 
 
-def fresh_plain(parameters: int) -> dict[str, np.ndarray]:
-    """The state of a plain step, which remembers nothing."""
-    return {}
-
-
 def plain_step(
     settings: PlainStep, state: Mapping[str, np.ndarray], centre_D: FloatArray, gradient_D: FloatArray
 ) -> tuple[Mapping[str, np.ndarray], FloatArray]:
@@ -158,7 +149,7 @@ class StepFunctions(NamedTuple):
 STEPS = {
     "adam": StepFunctions(fresh_adam, adam_step),
     "adamw": StepFunctions(fresh_adam, adamw_step),
-    "plain": StepFunctions(fresh_plain, plain_step),
+    "plain": StepFunctions(lambda parameters: {}, plain_step),
     "clipup": StepFunctions(fresh_clipup, clipup_step),
 }
 

@@ -164,7 +164,9 @@ def draw_comparison(
                 changed.append(reading.update())
             except ServiceError as error:
                 notices.append(error.sentence)
-        used = [reading for _, reading in readings if reading.data is not None and _begun(reading.data)]
+        used = [
+            reading for _, reading in readings if reading.data is not None and reading.data.history["generation"].size
+        ]
         notices += [
             f"{run.name} has no finished generation yet." for run, each_reading in readings if each_reading not in used
         ]
@@ -183,10 +185,6 @@ def draw_comparison(
         return Picture(title, shown | sections, of, not all(each_reading.whole for each_reading in used))
 
     return draw
-
-
-def _begun(data: RunData) -> bool:
-    return bool(data.history["generation"].size)
 
 
 def _notice(*said: object) -> Markup:

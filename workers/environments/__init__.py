@@ -159,7 +159,6 @@ def is_host_task(name: str) -> bool:
 
 
 def is_function_task(name: str) -> bool:
-    """Whether a name is that of a function of parameters."""
     kind, _, rest = name.partition(":")
     return kind == "function" and ":" in rest
 

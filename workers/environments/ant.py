@@ -91,7 +91,6 @@ class Ant(NamedTuple):
     step: Callable[[Any, Any], Any]
     """Function (state, action [8]) -> state one control step later; actions are clipped to [-1, 1]."""
     viewer: Viewer
-    """Data for replays."""
     contact_forces: Callable[[Any], Any]
     """Function from a state to torque and force on each of 14 bodies [84], in Gym's order, clipped."""
     system: System | None = None
@@ -185,7 +184,6 @@ def observe(state: Any) -> Any:
 
 
 def ant_viewer(system: System) -> Viewer:
-    """Data for replays of an ant."""
     return Viewer(system.mj_model, lambda state: com.to_world(system, state.centre, state.motion)[0], STEP_S)
 
 

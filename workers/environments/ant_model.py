@@ -47,7 +47,8 @@ def ant_model(walls: tuple[Segment, ...], drawn: bool = False) -> Any:
 
 def compiled(box_W_4: NDArray, drawn: bool = False) -> Any:
     """As `ant_model`, of walls as `boxes_of` returns them."""
-    root = ElementTree.parse(_assets() / "ant.xml").getroot()
+    assets = Path(gymnasium_package().__file__).parent / MODEL_FILES
+    root = ElementTree.parse(assets / "ant.xml").getroot()
     world = root.find("worldbody")
     assert world is not None
     for geom in root.iterfind(".//body//geom"):
@@ -79,7 +80,3 @@ def first_qpos(model: Any) -> NDArray:
     mujoco: Any = importlib.import_module("mujoco")
     at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "init_qpos")
     return model.numeric_data[model.numeric_adr[at] :][: model.nq].copy()
-
-
-def _assets() -> Path:
-    return Path(gymnasium_package().__file__).parent / MODEL_FILES

@@ -7,6 +7,7 @@ The model is that of `ant_model.py`, which C MuJoCo steps in `gymnasium:es_servi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -108,12 +109,8 @@ def nearest_boxes(box_W_4: NDArray, middle_2: Any, half_way_2: Any, count: int) 
         new = _nearest_point(middle_2 - box_4[:2], half_way_2, box_4[2:])[0], jnp.asarray(box_4)
         for place, old in enumerate(best):
             is_less = new[0] < old[0]
-            best[place], new = _ordered(is_less, new, old)
+            best[place], new = jax.tree.map(partial(jnp.where, is_less), (new, old), (old, new))
     return jnp.stack([box_4 for _, box_4 in best])
-
-
-def _ordered(is_less: Any, new: tuple[Any, Any], old: tuple[Any, Any]) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    return jax.tree.map(lambda a, b: jnp.where(is_less, a, b), (new, old), (old, new))
 
 
 def _nearest_point(middle_2: Any, half_way_2: Any, half_2: Any) -> tuple[Any, ...]:

@@ -159,7 +159,6 @@ def bounds_of(maze: str) -> tuple[Place, Place]:
 
 
 def goal_maze(maze: str) -> TaskSpec:
-    """Description of the task."""
     goals = goals_of(maze)
     return TaskSpec(
         name=maze,

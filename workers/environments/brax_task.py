@@ -125,7 +125,6 @@ class _BraxState(NamedTuple):
     touched_F: Any
     """Number of control steps in which each foot touched the floor."""
     steps: Any
-    """Number of control steps."""
 
 
 def describe(name: str, given: Mapping[str, OptionValue] = MappingProxyType({})) -> TaskSpec:
@@ -202,7 +201,6 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
 
 
 def _make_brax(name: str, backend: str) -> Any:
-    """Brax's own environment."""
     with quietly():
         return envs.get_environment(name, backend=backend)
 

@@ -36,7 +36,6 @@ class Feet(NamedTuple):
     touched_F: Any
     """Number of control steps after which each foot touched the floor."""
     steps: Any
-    """Number of control steps."""
 
 
 class GymState(NamedTuple):

@@ -68,7 +68,6 @@ OUTPUTS: Mapping[str, HostOutput] = {
         lambda spec, task: (task.descriptor_size,), np.float32, lambda step: step.environment.descriptor()
     ),
 }
-"""All outputs by name."""
 assert {*OUTPUTS} == {*AT_THE_END, *OF_STEPS}, "each name of protocol/episodes.py has its functions here"
 
 

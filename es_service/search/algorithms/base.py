@@ -116,7 +116,6 @@ def from_elite(
 
 
 def with_centre(state: SearchState, index: int, centre: CentreState) -> SearchState:
-    """The state with another centre at an index."""
     return replace(state, centres=(*state.centres[:index], centre, *state.centres[index + 1 :]))
 
 
@@ -173,7 +172,6 @@ class CentreEvaluation:
     population_max: float = np.nan
     """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
     episodes: int = 1
-    """Number of the episodes."""
     results: EpisodesResult | None = None
     """Results of each episode, [E]."""
 

@@ -19,7 +19,6 @@ ELITES = (
     "new policies many times, and none again. `deep_grid`: each policy once; it replaces any. Only a method that makes "
     "single policies has the last two."
 )
-"""Description of `search.elites`."""
 
 
 def settings_of(config: RunConfig, kind: type[Settings]) -> Settings:

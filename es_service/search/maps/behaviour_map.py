@@ -92,7 +92,6 @@ class Elite(Policy):
 
 
 def empty_map(geometry: Geometry, *, counts_samples: bool = False) -> BehaviourMap:
-    """A map without elites."""
     dimensions = len(geometry.bounds)
     shapes = {"descriptor_N_B": (0, dimensions)}
     columns: dict[str, Any] = {name: np.zeros(shapes.get(name, 0), kind) for name, kind in COLUMNS.items()}

@@ -66,7 +66,6 @@ class KeptPolicies:
 
 
 COLUMNS = tuple(field.name for field in fields(KeptPolicies))
-"""Names of the arrays."""
 
 
 def empty_kept(dimensions: int) -> KeptPolicies:

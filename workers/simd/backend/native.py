@@ -133,7 +133,6 @@ class Native(NamedTuple):
     """Machine code of a kernel in memory."""
 
     address: int
-    """Address of the function `kernel`."""
     alive: object
     """Object that must stay alive as long as the code is used."""
     code_bytes: int

@@ -23,7 +23,6 @@ class Processor(NamedTuple):
     set_mode: str
     """Lines of IR that keep the floating-point control register and then set it to {mode}."""
     restore_mode: str
-    """Lines that restore it."""
     zeros: int
     """Mode of kernels: rounds to nearest, has no traps, and denormal results and operands count as zeros. XLA computes
     in the same mode, and denormal numbers would make a kernel five times slower on x86-64."""

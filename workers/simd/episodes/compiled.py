@@ -59,7 +59,6 @@ class EpisodeKernel:
     carry: Carry
     """Shapes and dtypes of a carry."""
     episode_words: int
-    """Number of words of an episode's result."""
     finite_words: int
     """Number of words, the first of these, that are finite in an episode without a fault."""
     of_steps: dict[str, range]

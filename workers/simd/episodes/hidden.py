@@ -40,13 +40,11 @@ class Layer(NamedTuple):
     inputs: int
     outputs: int
     tiles: int
-    """Number of tiles."""
     tile: int
     """Vectors of outputs in a tile, which are summed at the same time."""
     first: int
     """Number of the layer's first vector of weights."""
     activation: Activation
-    """Function of its sums."""
     bias: bool
 
 
@@ -60,9 +58,7 @@ class Network(NamedTuple):
 
     hidden: tuple[Layer, ...]
     inputs: int
-    """Inputs of the last layer."""
     outputs: int
-    """Outputs of the last layer."""
     vectors: int
     """Number of vectors of weights of all hidden layers."""
     places: NDArray[np.uint32]

@@ -61,7 +61,6 @@ class BlockNoise(NamedTuple):
     right: int
     """Number of the first single number of B of the last layer, which the biases follow."""
     vectors: int
-    """Number of vectors of a pair."""
     places: NDArray[np.uint32]
     """Coordinates: of the first lanes of the vectors, then of the single numbers."""
 

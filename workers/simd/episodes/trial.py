@@ -136,7 +136,8 @@ def try_out(task: TaskSpec, environment: Environment) -> Examination:
     notes: tuple[str, ...] = ()
     alive_L = np.ones(LANES, bool)
     for traced, words, values, step in _tried(task, environment):
-        if (found := _hidden(values, alive_L)) is not None:
+        differs = _differ(values[:, :LANES], values[:, LANES:])  # whether JAX and simd have an output differently
+        if (found := _first(differs & alive_L)) is not None:
             return Examination(hidden=_explained(traced, words, found, step, is_hidden=True), notes=notes)
         if not notes and (found := _not_finite(traced, values, alive_L)) is not None:
             where = _explained(traced, words, found, step, is_hidden=False)
@@ -224,11 +225,6 @@ def _computed(traced: _Traced, words: np.ndarray, record: Record = lambda *_: No
 
     with np.errstate(all="ignore"):
         return as_words(evaluate(traced.graph, traced.outputs, words, operation, fuse=False))
-
-
-def _hidden(values: np.ndarray, alive_L: np.ndarray) -> FaultPlace | None:
-    """The first output that JAX and simd have differently."""
-    return _first(_differ(values[:, :LANES], values[:, LANES:]) & alive_L)
 
 
 def _differ(words: np.ndarray, others: np.ndarray) -> np.ndarray:

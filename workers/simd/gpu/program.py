@@ -55,7 +55,6 @@ class GpuLayer(NamedTuple):
     tiles: int
     rows_of_tile: int
     first: int
-    """Number of its first row."""
     bias: bool
     activation: Activation | None
     is_last: bool

@@ -40,7 +40,6 @@ class _Program(NamedTuple):
     layers: tuple[GpuLayer, ...]
     places: np.ndarray
     on_gpu: GpuArray
-    """The places."""
 
 
 def episodes_on_gpu(environment: Environment, spec: WorkerSpec, gpu: Gpu | None = None) -> Compilable:

@@ -20,7 +20,6 @@ class Operation(NamedTuple):
     takes: str
     """Dtypes of the arguments, one letter each."""
     gives: str
-    """Dtype of the result."""
     meaning: Callable[..., Any]
     """The operation in NumPy, which folds constants and which tests compare the machine code with."""
     llvm: str
@@ -115,7 +114,6 @@ OPERATIONS: dict[str, Operation] = {
 """Operations by name. Products and sums are separate nodes; `schedule.py` fuses them by its rule."""
 
 NUMPY_DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
-"""NumPy's dtype for each dtype of a graph."""
 BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
 """Operations that pass floats through unchanged. All others replace denormal arguments and results by zeros."""
 ROUNDED = {"mul", "div", "fma"}

@@ -218,7 +218,6 @@ def _total_order(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def _positions(t: Tracer, shape: tuple[int, ...], axis: int) -> Nodes:
-    """Nodes of the position of each element along an axis."""
     along = np.arange(shape[axis], dtype=np.int32)
     return np.broadcast_to(t.constants(along).reshape([-1 if k == axis else 1 for k in range(len(shape))]), shape)
 
