@@ -48,7 +48,8 @@ from es_service.cli.evaluate import evaluate
 from es_service.cli.jobs import job_commands
 from es_service.cli.report import export, report, watch
 from es_service.cli.session import polish, session, told_to_user, verify
-from es_service.cli.show import config_, digest_, help_, list_, status
+from es_service.cli.show import config_, digest_, help_, list_
+from es_service.cli.status import status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.config.changes import again_with
 from es_service.config.given import parse_overrides

@@ -1,4 +1,4 @@
-"""The commands that only read and print: `status`, `digest`, `config` and `list`; and `help`, sections of the guides.
+"""The commands that only read and print: `digest`, `config` and `list`; and `help`, sections of the guides.
 
 `--json` prints the content of the tables as data.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -17,7 +17,6 @@ from rich.markdown import Markdown
 from rich.padding import Padding
 from rich.table import Table
 
-from es_service import api
 from es_service.cli.common import (
     JsonOption,
     RunsArgument,
@@ -27,64 +26,20 @@ from es_service.cli.common import (
     of_each,
     print_json,
     print_line,
-    print_note,
-    problem_data,
     readable,
 )
-from es_service.cli.status import follow_status, print_status
 from es_service.config.given import first_sentence, shipped_configs, shipped_text
 from es_service.config.keys import SECTIONS, unknown_key
 from es_service.config.search import PRESETS, preset_table
 from es_service.config.tasks import TASKS, tasks_of_suite
 from es_service.config.text import did_you_mean, nearest, one_of, show
 from es_service.config.values import DescribedKey, described_keys, methods_words
-from es_service.errors import ConfigError, ServiceError
-from es_service.protocol.machine import given_path
+from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, allowed_text
 from es_service.protocol.sources import SUITES
-from es_service.report.progress import short
-from es_service.runs.run_status import (
-    Recent,
-    RunStatus,
-    newest_runs,
-    output_of,
-    read_recent,
-    read_status,
-    runs_of,
-    state,
-)
-from es_service.runs.view import open_run
 from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.store.digest import checked_parts, digest_of
-
-
-def status_data(status: RunStatus) -> dict[str, Any]:
-    """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
-    that generation climb, and those of recent ones, or in `problem` why that is not known; `tries` has the mean fitness
-    of each policy that did not reach `target_certified` in new episodes."""
-    run, row = status.run, status.row
-    recent = read_recent(run, row["generation"]) if row else Recent()
-    return {
-        "run": str(run.folder),
-        "run_id": run.run_id,
-        "task": run.constants["task.environment"],
-        "algorithm": run.constants["search.algorithm"],
-        "seed": run.constants["seed"],
-        "state": state(status),
-        "driver": status.driver,
-        "last_end": status.end,
-        "output": status.output,
-        "limits": status.limits,
-        "target_certified": status.target_certified,
-        "tries": status.tries,
-        "newest": row,
-        "objectives": {
-            "newest": recent.newest and recent.newest._asdict(),
-            "recent": recent.objectives and recent.objectives._asdict(),
-            "problem": recent.problem,
-        },
-    }
 
 
 def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
@@ -95,60 +50,6 @@ def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
         "presets": [asdict(row) for row in preset_table(ALGORITHMS)],
         "configs": list(shipped_configs()),
     }
-
-
-NEWEST = 10
-"""Most runs that `status` shows without a folder."""
-
-
-def status(
-    folders: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            parser=given_path,
-            metavar="[RUN]...",
-            help="Folders of runs or of sweeps; default: the newest runs under runs/.",
-            show_default=False,
-        ),
-    ] = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Watch one run until its driver ends.")] = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Show the state of a run, also while it is running; for a sweep or several runs, print one line each."""
-    if follow and len(folders or ()) != 1:
-        raise ConfigError(f"--follow: needs exactly one folder, got {len(folders or ())}; give one, or omit --follow")
-    if follow and as_json:
-        raise ConfigError("--follow and --json cannot be combined; omit one of them")
-    if not folders:
-        found = newest_runs(api.RUNS_FOLDER)
-        folders = found[:NEWEST]
-        if not folders and not as_json:
-            print_note(f"there is no run under {api.RUNS_FOLDER}/ in this folder; give the folder of a run")
-            return
-        if len(found) > NEWEST and not as_json:
-            everything = command("status", f"{api.RUNS_FOLDER}/")
-            print_note(f"the {NEWEST} newest of {len(found)} runs under {api.RUNS_FOLDER}/; all: {everything}")
-    elif is_single(folders) and not as_json:
-        run = api.open_run(folders[0])
-        (follow_status if follow else print_status)(console, run)
-        return
-    if follow:
-        names = ", ".join(run.name for run in runs_of(folders[0]))
-        raise ConfigError(f"--follow: needs one run; {folders[0]} has several: {names}")
-    shown = _print_statuses(folders) if as_json else print_overview(console, folders)
-    raise typer.Exit(0 if shown else 1)
-
-
-def _print_statuses(folders: list[Path]) -> bool:
-    """Print a list with an object for each run; return whether all runs could be read."""
-    statuses: list[dict[str, Any]] = []
-    for folder, data in of_each(folders, lambda run: status_data(read_status(api.open_run(run)))):
-        if isinstance(data, ServiceError):
-            statuses.append(problem_data(folder, data))
-        else:
-            statuses.append(data or {"run": str(folder), "state": NOT_STARTED, "newest": None})
-    print_json(statuses)
-    return not any("error" in run_status for run_status in statuses)
 
 
 def digest_(
@@ -334,54 +235,6 @@ def _option(option: Option) -> str:
 
 def _value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else show(value)
-
-
-_COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
-NOT_STARTED = "not started"
-"""State of a sweep's run that has no folder yet."""
-
-
-def print_overview(console: Console, folders: Sequence[Path]) -> bool:
-    """Print a line for each run, with the error if it cannot be read; return whether all could be read.
-
-    Args:
-        folders: those of runs or of sweeps.
-    """
-    rows, problems = [], 0
-    for folder, result in of_each(folders, lambda run: _row(read_status(open_run(run)))):
-        if isinstance(result, ServiceError):
-            rows.append(_without_row(folder, f"error: {' '.join(result.sentence.split())}"))
-            problems += 1
-        elif result is None:
-            output = output_of(folder)
-            rows.append(_without_row(folder, NOT_STARTED + (f"; its output is in {output}" if output else "")))
-        else:
-            rows.append(result)
-    widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
-    for row in (_COLUMNS, *rows):
-        line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        print_line(console, line)
-    return not problems
-
-
-def _without_row(folder: Path, state: str) -> tuple[str, ...]:
-    return (str(folder), *["-"] * (len(_COLUMNS) - 2), state)
-
-
-def _row(status: RunStatus) -> tuple[str, ...]:
-    constants, limits, row = status.run.constants, status.limits, status.row
-    who = (str(status.run.folder), constants["search.algorithm"], constants["task.environment"], str(constants["seed"]))
-    if row is None:
-        return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(status))
-    generations, steps = limits.get("generations"), limits.get("env_steps")
-    return (
-        *who,
-        f"{row['generation']:,}" + (f" of {generations:,}" if generations else ""),
-        short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
-        f"{row['best_fitness']:.2f}",
-        f"{row['map_cells']:,}" if "map_cells" in row else "-",
-        state(status),
-    )
 
 
 # The command `help`: sections of the guides in the terminal, for whoever has a wheel and no clone.

@@ -97,7 +97,7 @@ _EPISODES = (
     Column("reset_ask", "INTEGER", False, "number of its ask there; populations and policies count separately"),
     Column("reset_policy", "INTEGER", False, "number of the policy in its ask; none for a centre"),
 )
-"""Which episodes an evaluation consisted of. Runs of versions before 0.12 do not have these columns."""
+"""Which episodes an evaluation consisted of."""
 _SEARCH_AND_TIMES = (
     Column(
         "centre",

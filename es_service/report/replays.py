@@ -90,8 +90,8 @@ def _notes(replay: Replay, hidden: str | None) -> Markup:
     mean = f"(mean of all its evaluation episodes: {number(replay.candidate.stored_fitness)})"
     if stored is None:
         if np.isfinite(replay.candidate.stored_fitness):
-            text = "The run does not have the address of this policy's evaluation episodes, as runs of versions before "
-            text += f"0.12, so this is another episode of the policy: {seen} {mean}."
+            text = "The run does not have the address of this policy's evaluation episodes, so this is another episode "
+            text += f"of the policy: {seen} {mean}."
         else:
             text = "This run is a fork whose settings have changed the meaning of fitness, so earlier evaluations of "
             text += f"the policy do not count. This is an episode with the settings of this run: {seen}."

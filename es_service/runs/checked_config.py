@@ -163,12 +163,9 @@ def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
 
 
 def _fits(meta: RunMeta, history: tuple[Column, ...], evaluations: tuple[Column, ...]) -> bool:
-    """Whether this version can continue the tables of a run, which may lack columns that are not in the digest."""
-    lacking = [column for column in evaluations if column not in meta.evaluation_columns]
-    kept = tuple(column for column in evaluations if column not in lacking)
-    has_all = not any(column.deterministic for column in lacking)
+    """Whether this version can continue the tables of a run, whose history may lack columns of LATER."""
     expected = tuple(column for column in history if column in meta.columns or column.name not in LATER)
-    return meta.columns == expected and meta.evaluation_columns == kept and has_all
+    return meta.columns == expected and meta.evaluation_columns == evaluations
 
 
 # What computes a run, its platform and its code: recorded with the generations, compared when the run continues.

@@ -16,8 +16,8 @@ import es_service.cli
 from es_service import api
 from es_service.cli import common, sweep
 from es_service.cli.common import command, print_line, text_console
-from es_service.cli.show import print_catalogue, print_overview
-from es_service.cli.status import print_status, print_summary
+from es_service.cli.show import print_catalogue
+from es_service.cli.status import print_overview, print_status, print_summary
 from es_service.config.text import show
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.options import choice

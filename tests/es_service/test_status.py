@@ -18,8 +18,7 @@ from es_service import api
 from es_service.cli import status
 from es_service.cli.common import settings, text_console
 from es_service.cli.main import app
-from es_service.cli.show import print_overview
-from es_service.cli.status import follow_status, print_status, print_summary
+from es_service.cli.status import follow_status, print_overview, print_status, print_summary
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.state import Stop
 from es_service.report.data import read_run
@@ -214,7 +213,7 @@ def test_without_a_folder_the_newest_runs_are_shown(run, tmp_path, monkeypatch):
         os.utime(tmp_path / "runs" / name / "run.db", (1e9 - age, 1e9 - age))
     shown = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"}).stdout.splitlines()
     assert [line.split()[0] for line in shown] == ["run", "runs/new", "runs/old"]
-    monkeypatch.setattr("es_service.cli.show.NEWEST", 1)
+    monkeypatch.setattr("es_service.cli.status.NEWEST", 1)
     found = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"})
     assert [line.split()[0] for line in found.stdout.splitlines()] == ["run", "runs/new"]
     assert "the 1 newest of 2 runs under runs/; all: es-service status runs/" in found.stderr

@@ -10,8 +10,7 @@ import pytest
 
 from es_service import api
 from es_service.cli.common import text_console
-from es_service.cli.show import status_data
-from es_service.cli.status import print_status, print_summary
+from es_service.cli.status import print_status, print_summary, status_data
 from es_service.protocol.noise import Domain
 from es_service.report.data import read_run
 from es_service.report.summary import what_was_run
