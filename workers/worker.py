@@ -198,8 +198,9 @@ def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], K
     def gradient_sums(weights_C_P: Sequence[Any], keys_C_P: Any) -> list[Any]:
         return [gradient_sum(*block) for block in zip(weights_C_P, keys_C_P, strict=True)]
 
-    def compile_gradient_sum(weights_C_P: Sequence[Any], keys_C_P: Any) -> None:
-        gradient_sum.compile(weights_C_P[0], keys_C_P[0])
+    gradients = Compilable(
+        gradient_sums, lambda weights_C_P, keys_C_P: gradient_sum.compile(weights_C_P[0], keys_C_P[0])
+    )
 
     def gradient_results(work: Sequence[Work], sums_C_D: list[Any]) -> list[ChunkResult]:
         return [GradientResult(np.array(sum_D)) for sum_D in sums_C_D]
@@ -207,7 +208,7 @@ def kinds_of(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], K
     return {
         TrainingChunk: Kind(functions.training, training_arguments, training_results),
         EvaluationChunk: Kind(functions.evaluation, evaluation_arguments, evaluation_results),
-        GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
+        GradientChunk: Kind(gradients, gradient_arguments, gradient_results),
         PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec), partial(_policy_results, spec)),
     }
 

@@ -140,7 +140,8 @@ def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
             if solved
             else ()
         )
-        rows.append((summary.group.name, _seeds_of(summary.group), *reached, *cells))
+        seeds = f"{summary.group.seeds}" + ("" if summary.group.seeds == runs else f" in {counted(runs, 'run')}")
+        rows.append((summary.group.name, seeds, *reached, *cells))
     heads = ("group", "seeds", *solved, *heads_of.values())
     return Markup(tables(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
 
@@ -174,12 +175,6 @@ def _about_intervals(groups: Sequence[Group]) -> str:
 
 def _seeds(groups: Sequence[Group]) -> str:
     return "; ".join(f"{group.name} has {counted(group.seeds, 'seed')}" for group in groups)
-
-
-def _seeds_of(group: Group) -> str:
-    """The number of seeds of a group, and that of its runs if some have the same."""
-    runs = len(group.runs)
-    return f"{group.seeds}" if group.seeds == runs else f"{group.seeds} in {counted(runs, 'run')}"
 
 
 def _interval(summary: Summary, column: str) -> str:

@@ -104,9 +104,8 @@ class PolicyEvaluator:
         self.parameters = policy_spec(config, self.task).parameters
         """Number of parameters of a policy, D."""
         self._start = start
-        self._engine = start()
-        self._has_engine = True
-        """False after an error of the rollouts, until the next call starts another one."""
+        self._engine: Engine[Any] | None = start()
+        """None after an error of the rollouts, until the next call starts another one."""
         self._closed = ""
         self._maker = os.getpid()
         self._in_turn = RLock()  # an error during a call closes the evaluator in its turn
@@ -158,13 +157,12 @@ class PolicyEvaluator:
         with self._in_turn:
             if self._closed:
                 raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
-            if not self._has_engine:
-                self._engine, self._has_engine = self._start(), True
+            self._engine = engine = self._engine or self._start()
             try:
-                answers = self._engine.evaluate(asked.work)
+                answers = engine.evaluate(asked.work)
             except Exception:  # the engine may have stopped at any point
-                self._has_engine = False
-                self._engine.close()
+                self._engine = None
+                engine.close()
                 raise
             except BaseException as error:  # an interrupt ends whatever uses the evaluator
                 self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
@@ -188,7 +186,7 @@ class PolicyEvaluator:
         with self._in_turn:
             if not self._closed:
                 self._closed = why
-                if self._has_engine:
+                if self._engine is not None:
                     self._engine.close()
 
 

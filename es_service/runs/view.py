@@ -329,13 +329,8 @@ class Run:
     @property
     def parameter_spec(self) -> ParameterSpec | None:
         """Names, bounds and start of the parameters of the function that is the run's task; None for other tasks."""
-        return parameter_spec(self.meta)
-
-
-def parameter_spec(meta: RunMeta) -> ParameterSpec | None:
-    """See `Run.parameter_spec`."""
-    fields = meta.task.get("parameters")
-    return None if fields is None else ParameterSpec.from_fields(*fields)
+        fields = self.meta.task.get("parameters")
+        return None if fields is None else ParameterSpec.from_fields(*fields)
 
 
 def _frame(columns: Columns) -> pd.DataFrame:

@@ -24,7 +24,7 @@ from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS, OURS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, changed_config, load, load_config
 from workers.rollouts import BACKENDS
-from workers.rollouts.xla_and_simd import Simd
+from workers.rollouts.simd import Simd
 
 # What a config resolves to
 

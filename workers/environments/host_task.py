@@ -130,7 +130,8 @@ class HostEnvironment:
             result = self._object.reset(seed=seed)
         else:
             result = self._task.reset_by_key(self._object, key)
-        observation, info = result if _is_pair(result) else (result, {})
+        is_pair = isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping | None)
+        observation, info = result if is_pair else (result, {})  # as those of Gymnasium return, or the first alone
         self._require_info("reset", info)
         self._episode = HostEpisode(self._object, self._observed("reset", observation), info, dict(info))
         self.first_observation_O = self._episode.observation_O
@@ -368,8 +369,3 @@ def _bool(value: Any) -> bool | None:
 def _shown(value: Any) -> str:
     """A value in a message, on one line and not too long."""
     return "None (is a `return` missing?)" if value is None else shorten(repr(value), 100, placeholder=" ...")
-
-
-def _is_pair(result: Any) -> bool:
-    """Whether a reset has returned (observation, info), as those of Gymnasium do."""
-    return isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping | None)

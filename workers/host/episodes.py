@@ -172,7 +172,7 @@ def run_episodes(
     trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
     outputs = Outputs(spec.outputs, spec, task, count)
     bad_observation_L: dict[int, str] = {}  # lane -> the first observation on which no policy can act
-    is_bad = np.isnan if spec.observation_clip is not None else _is_not_finite
+    is_bad = np.isnan if spec.observation_clip is not None else lambda array: ~np.isfinite(array)
     bad_reward_L: dict[int, str] = {}  # lane -> its first reward that is not finite
 
     def watch(lane: int, environment: HostEnvironment) -> None:
@@ -265,10 +265,6 @@ def run_episodes(
         of_steps=outputs.of_steps,
         failures=tuple(failures),
     )
-
-
-def _is_not_finite(array: FloatArray) -> NDArray[np.bool_]:
-    return ~np.isfinite(array)
 
 
 def _why_invalid(returns: np.float32, descriptor_B: FloatArray) -> str:

@@ -10,9 +10,11 @@ from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.process_environment import on_gpu
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers.compiling import xla_cache_settings
+from workers.rollouts.asked import AskedRollout
 from workers.rollouts.backend import RolloutBackend
-from workers.rollouts.host import AskedRollout, Host
-from workers.rollouts.xla_and_simd import Simd, Xla
+from workers.rollouts.host import Host
+from workers.rollouts.simd import Simd
+from workers.rollouts.xla import Xla
 
 BACKENDS: dict[str, RolloutBackend] = {rollout.name: rollout for rollout in (AskedRollout(), Host(), Xla(), Simd())}
 """Name, as in `compute.rollout` -> rollout, from the slowest to the fastest. `protocol.rollouts.choose` is what `auto`

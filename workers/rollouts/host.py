@@ -1,11 +1,9 @@
-"""The rollout `host`: environments that are Python objects, stepped by their own code, and policies in NumPy; and the
-rollout `asked`, of which the service computes nothing."""
+"""The rollout `host`: environments that are Python objects, stepped by their own code, and policies in NumPy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import NoReturn
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from es_service.protocol.policies import POLICY_SLOTS, explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import progress
 from workers.compiling import Compilable
-from workers.environments import TaskError, is_function_task, make_function_task, make_host_task
+from workers.environments import is_function_task, make_function_task, make_host_task
 from workers.host import episodes as host_episodes  # modules, which import `rollouts.backend` in turn
 from workers.host import functions as host_functions
 from workers.policies.policy import gradient_summer, members
@@ -156,28 +154,3 @@ def _recording(run: Callable[..., Episodes], request: RecordRequest) -> Recordin
         fitness=float(episodes.fitness[slot]),
         trace_T_B=episodes.trace_T_B[slot],
     )
-
-
-class AskedRollout(RolloutBackend):
-    """The program that asks a search computes the episodes by itself. Chunks have all pairs, since nothing is
-    distributed."""
-
-    name = "asked"
-    task_kinds = ("caller",)
-    compile_s = (0, 0)
-    chunk_pairs = (1, 2**20)
-
-    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
-        _refuse()
-
-    def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
-        _refuse()
-
-    def random_steps(
-        self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
-    ) -> Callable[[int], int]:
-        _refuse()
-
-
-def _refuse() -> NoReturn:
-    raise TaskError("the episodes of this task are the caller's, so the service cannot compute any")

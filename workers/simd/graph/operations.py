@@ -47,19 +47,6 @@ def _unsigned(x: Any) -> Any:
     return np.asarray(x, np.int32).view(np.uint32)
 
 
-def _bits(x: Any) -> Any:
-    return np.asarray(x, np.float32).view(np.int32)
-
-
-def _truncated_quotient(a: Any, b: Any) -> Any:
-    """Quotient of integers, rounded towards zero."""
-    return (a - np.fmod(a, b)) // b
-
-
-def _float(x: Any) -> Any:
-    return np.asarray(x, np.int32).view(np.float32)
-
-
 OPERATIONS: dict[str, Operation] = {
     "add": Operation("ff", "f", np.add, "fadd {F} {0}, {1}"),
     "sub": Operation("ff", "f", np.subtract, "fsub {F} {0}, {1}"),
@@ -84,8 +71,9 @@ OPERATIONS: dict[str, Operation] = {
     "iand": Operation("ii", "i", np.bitwise_and, "and {I} {0}, {1}", commutes=True),
     "ior": Operation("ii", "i", np.bitwise_or, "or {I} {0}, {1}", commutes=True),
     "ixor": Operation("ii", "i", np.bitwise_xor, "xor {I} {0}, {1}", commutes=True),
-    # Integers are never divided by 0, nor the least integer by -1; elementary.py ensures this.
-    "sdiv": Operation("ii", "i", _truncated_quotient, "sdiv {I} {0}, {1}"),
+    # Integers are never divided by 0, nor the least integer by -1; elementary.py ensures this. Quotients are rounded
+    # towards zero.
+    "sdiv": Operation("ii", "i", lambda a, b: (a - np.fmod(a, b)) // b, "sdiv {I} {0}, {1}"),
     "srem": Operation("ii", "i", np.fmod, "srem {I} {0}, {1}"),
     "udiv": Operation("ii", "i", lambda a, b: (_unsigned(a) // _unsigned(b)).view(np.int32), "udiv {I} {0}, {1}"),
     "urem": Operation("ii", "i", lambda a, b: (_unsigned(a) % _unsigned(b)).view(np.int32), "urem {I} {0}, {1}"),
@@ -101,8 +89,8 @@ OPERATIONS: dict[str, Operation] = {
     "float_of_uint": Operation("i", "f", lambda a: _unsigned(a).astype(np.float32), "uitofp {I} {0} to {F}"),
     # The argument is in the range of int32; elementary.py ensures this.
     "int_of_float": Operation("f", "i", lambda a: np.asarray(a).astype(np.int32), "fptosi {F} {0} to {I}"),
-    "bits": Operation("f", "i", _bits, "bitcast {F} {0} to {I}"),
-    "unbits": Operation("i", "f", _float, "bitcast {I} {0} to {F}"),
+    "bits": Operation("f", "i", lambda a: np.asarray(a, np.float32).view(np.int32), "bitcast {F} {0} to {I}"),
+    "unbits": Operation("i", "f", lambda a: np.asarray(a, np.int32).view(np.float32), "bitcast {I} {0} to {F}"),
     "int_of_bool": Operation("b", "i", lambda a: np.asarray(a).astype(np.int32), "zext {B} {0} to {I}"),
     "and": Operation("bb", "b", np.logical_and, "and {B} {0}, {1}", commutes=True),
     "or": Operation("bb", "b", np.logical_or, "or {B} {0}, {1}", commutes=True),
