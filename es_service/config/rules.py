@@ -7,15 +7,15 @@ a generator that yields a `Problem` for each thing that is wrong, and put it int
 
 from __future__ import annotations
 
-import math
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 from es_service.config.given import start_of
-from es_service.config.keys import BUDGET, FIELDS, search_fields
-from es_service.config.parts import LARGEST, RESOURCES, TASK_OPTIONS, counts
+from es_service.config.keys import BUDGET, FIELDS
+from es_service.config.map_rules import MAP_RULES
+from es_service.config.parts import RESOURCES, TASK_OPTIONS
 from es_service.config.resolution import Unknown, Values, only_centres
 from es_service.config.search import SearchConfig
 from es_service.config.tasks import CALLER, is_start
@@ -29,13 +29,6 @@ from es_service.protocol.rollouts import CHUNK_PAIRS
 Rule = Callable[[Values, TaskSpec], Iterable[Problem]]
 Problems = Iterator[Problem]
 
-MOST_CELLS = 10_000_000
-MOST_CVT_CELLS = MOST_SLOTS = 4096
-PLACES_PER_CENTROID = {"lloyd": 50, "kmeans": 10}
-"""Random places by which centroids are placed, by `map.centroids`."""
-LLOYD_STEPS = 20
-MOST_PLACING_S = 600.0
-"""Longest estimated time of that, in seconds."""
 MOST_PARAMETERS = 80_000_000
 """The store keeps a centre and Adam's two moments, 12 bytes per parameter, in one value; SQLite allows 1e9 bytes."""
 MOST_DESCRIPTOR_DIMENSIONS = 973
@@ -152,103 +145,6 @@ def network_fits_the_store(config: Values, task: TaskSpec) -> Problems:
         what = f"{show(hidden)} makes more than {MOST_PARAMETERS:,} parameters for {task.name}"
         problem = f"{what}, which is the most that the run store can keep; the layers must be narrower"
         yield problem_of("policy.hidden", hidden, problem, allowed="narrower")
-
-
-# The map
-
-
-def bounds_fit(config: Values, task: TaskSpec) -> Problems:
-    names, bounds = task.descriptor_names, config["map.bounds"]
-    if bounds is None:
-        what = f"missing, since the descriptor of {task.name} has no bounds; give [low, high] for each of"
-        yield problem_of("map.bounds", None, f"{what} {', '.join(names)}, or set map.enabled = false")
-        return
-    if any(abs(number) > LARGEST for pair in bounds for number in pair):
-        yield not_allowed("map.bounds", bounds, f"within {LARGEST:g} of 0")
-    if len(bounds) != len(names):
-        allowed = f"a list of {len(names)} pairs [low, high], or auto"
-        what = f"{show(bounds)} has {len(bounds)} pairs, but the descriptor has {len(names)} dimensions"
-        problem = f"{what} ({', '.join(names)}); must be {allowed}"
-        yield problem_of("map.bounds", bounds, problem, allowed=allowed)
-        return
-    for name, pair in zip(names, bounds, strict=True):
-        if not pair[0] < pair[1]:
-            allowed, meant = "[low, high] with low below high", pair[::-1] if pair[0] > pair[1] else None
-            hint = f"; did you mean {show(meant)}?" if meant else ""
-            what = f"{show(pair)} for {name} is not allowed; must be {allowed}{hint}"
-            yield problem_of("map.bounds", pair, what, allowed=allowed, suggestion=meant)
-
-
-def qd_offset_is_finite(config: Values, task: TaskSpec) -> Problems:
-    if abs(offset := config["map.qd_offset"]) > LARGEST:
-        yield not_allowed("map.qd_offset", offset, f"within {LARGEST:g} of 0")
-
-
-def cells_fit(config: Values, task: TaskSpec) -> Problems:
-    names, cells, kind = task.descriptor_names, counts(config["map.cells"]), config["map.kind"]
-    most = MOST_CVT_CELLS if kind == "cvt" else MOST_CELLS
-    if len(cells) != (wanted := 1 if kind == "cvt" else len(names)):
-        what = "one number for a cvt" if kind == "cvt" else f"{wanted} numbers, one for each of {', '.join(names)}"
-        allowed, problem = f"{what}, or auto", f"{show(cells)} has {len(cells)} numbers; must be {what}, or auto"
-    elif math.prod(cells) > most:
-        allowed, hint = (
-            f"at most {most:,}",
-            {"cvt": " for a cvt", "grid": "; with many dimensions use map.kind = cvt"}.get(kind, ""),
-        )
-        problem = f"{show(cells)} makes {math.prod(cells):,} cells; must be {allowed}{hint}"
-    elif kind == "cvt" and (seconds := placing_seconds(cells[0], len(names), config["map.centroids"])) > MOST_PLACING_S:
-        allowed = f"at most {int(cells[0] * math.sqrt(MOST_PLACING_S / seconds)):,}"
-        what = f"placing {cells[0]:,} centroids in {len(names):,} dimensions would take about {seconds:.0f} s"
-        hint = "" if config["map.centroids"] == "kmeans" else ", or map.centroids = kmeans, which is faster"
-        problem = f"{what}; must be {allowed}{hint}"
-    else:
-        return
-    yield problem_of("map.cells", cells, problem, allowed=allowed)
-
-
-def centroids_are_for_a_cvt(config: Values, task: TaskSpec) -> Problems:
-    if (kind := config["map.kind"]) != "cvt" and (how := config["map.centroids"]) != "lloyd":
-        what = f"{show(how)} has no effect with map.kind = {kind}; leave it out (a key of kind cvt)"
-        yield problem_of("map.centroids", how, what, suggestion="lloyd")
-
-
-def slots_are_for_a_dominated_map(config: Values, task: TaskSpec) -> Problems:
-    if (kind := config["map.kind"]) == "dominated":
-        if (slots := config["map.slots"]) > MOST_SLOTS:
-            yield not_allowed("map.slots", slots, f"at most {MOST_SLOTS:,}")
-        return
-    for key in ("map.slots", "map.neighbours"):
-        if (value := config[key]) != (default := FIELDS[key].default):
-            what = f"{show(value)} has no effect with map.kind = {kind}; leave it out (a key of kind dominated)"
-            yield problem_of(key, value, what, suggestion=default)
-
-
-def slots_have_no_history(config: Values, task: TaskSpec) -> Problems:
-    """What is counted for a cell, or kept in it, would be of another elite as soon as a slot has one."""
-    if config["map.kind"] != "dominated" or "dominated" not in config.settings.map_kinds:
-        return
-    if (kind := config["search.elites.kind"]) != "once":
-        why = " with map.kind = dominated, whose slots have no places between which elites could move"
-        yield not_allowed("search.elites.kind", kind, "once", why=why)
-    for key in ("search.starts", "search.cell_sampling"):
-        if config.get(key) == "least_tried":
-            why = " with map.kind = dominated, whose slots change their elites"
-            others = [
-                name for name in get_args(search_fields(config.settings)[key].annotation) if name != "least_tried"
-            ]
-            yield not_allowed(key, "least_tried", one_of(others), why=why)
-
-
-def placing_seconds(cells: int, dimensions: int, centroids: str) -> float:
-    """About how long it takes to place the centroids of a cvt, in seconds, as measured on one core of a Zen 4.
-
-    Args:
-        centroids: `map.centroids`; k-means is counted with as many steps as Lloyd's algorithm, which it rarely needs.
-    """
-    pairs = LLOYD_STEPS * PLACES_PER_CENTROID.get(centroids, 0) * cells**2
-    return pairs * (
-        1.4e-9 * min(dimensions, 7) + 1e-10 * dimensions
-    )  # from five dimensions on as a product of matrices
 
 
 # The search
@@ -476,12 +372,7 @@ RULES: tuple[Rule, ...] = (
     callers_episodes,
     output_fits,
     network_fits_the_store,
-    bounds_fit,
-    qd_offset_is_finite,
-    cells_fit,
-    centroids_are_for_a_cvt,
-    slots_are_for_a_dominated_map,
-    slots_have_no_history,
+    *MAP_RULES,
     objectives_fit,
     nearest_elites_need_a_place,
     *METHOD_RULES,

@@ -9,8 +9,8 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
+from es_service.config.map_rules import placing_seconds
 from es_service.config.model import RunConfig
-from es_service.config.rules import placing_seconds
 from es_service.config.sections import MapConfig
 from es_service.config.tasks import task_of
 from es_service.config.workload import parallel_sentence, policy_spec

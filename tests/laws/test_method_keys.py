@@ -152,8 +152,6 @@ NOT_MEASURED = {
     "compute.rollout": "the other one is XLA",
     "compute.rollout_block_pairs": "only XLA uses it",
 }
-WITH_TOP_PAIRS = ("ars", "polish")
-"""Methods whose shaping is top_pairs and whose step is plain by default."""
 ONE_VALUE = {
     "search.centres": ("es", "ars", "me_es", "memes", "polish", "jedi"),
     "policy.observation_normalization": ("map_elites",),

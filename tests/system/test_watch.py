@@ -1,6 +1,6 @@
 """The live page in a headless browser, of a server in a process of its own, as users have it.
 
-`make test` watches one run that goes on, is killed and is resumed; `make long` does the rest.
+`make long` runs all but the last test.
 """
 
 import contextlib

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from es_service.config.rules import LLOYD_STEPS, PLACES_PER_CENTROID
+from es_service.config.map_rules import LLOYD_STEPS, PLACES_PER_CENTROID
 from es_service.protocol.messages import Bounds, TaskSpec
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 
