@@ -65,7 +65,7 @@ class TaskBraxEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """The state after an action [A]."""
-        carry, seen = self._functions.step(state.pipeline_state, action)
+        carry, seen = self._functions.step(cast(Any, state.pipeline_state), action)
         return replace(
             state,
             pipeline_state=cast(Any, carry),
