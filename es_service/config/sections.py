@@ -35,8 +35,8 @@ class TaskConfig(Section):
     """The task that is to be learned. Constants of the run."""
 
     environment: Text = Field(
-        description="Name of the task: a shipped one, `brax:NAME`, `mujoco:ID`, `gymnasium:ID`, `gymnax:NAME`, "
-        "`jumanji:NAME`, `kheperax:NAME`, `playground:NAME`, or one of your own: `module:Class` in JAX, "
+        description="Name of the task: a shipped one, `brax:NAME`, `mujoco:ID`, `gymnasium:ID`, `craftax:NAME`, "
+        "`gymnax:NAME`, `jumanji:NAME`, `kheperax:NAME`, `playground:NAME`, or one of your own: `module:Class` in JAX, "
         "`python:module:Class`, or `function:module:name`."
     )
     episode_steps: Count = Field(description="Length of an episode in control steps. `null`: the task's own length.")

@@ -36,7 +36,7 @@ DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
 PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
-SUITES = ("gymnax", "jumanji", "kheperax", "playground")
+SUITES = ("craftax", "gymnax", "jumanji", "kheperax", "playground")
 """Packages of environments in JAX, such as `gymnax:CartPole-v1`, by their names on the package index, which are also
 those of our extras."""
 VERSIONED = {**{suite: (suite,) for suite in SUITES}, "evosax": ("evosax", "optax")}

@@ -4,6 +4,7 @@
     python -m tests.benchmarks.certified --task ant_trap --method nsr_es me_es --seeds 0:2
     python -m tests.benchmarks.certified --physics mujoco                  # AntMaze and AntTrap by MuJoCo's equations
     python -m tests.benchmarks.certified --map grid dominated --task point_maze --seeds 0:3 --marks 1e7
+    python -m tests.benchmarks.certified --map grid dominated --task kheperax --seeds 0:3 --marks 2.5e7
     python -m tests.benchmarks.certified --table                           # only print the tables
     python -m tests.benchmarks.certified --config my.yaml --seeds 100:101 --marks 30_000_000 --set search.sigma=0.05
 
@@ -17,7 +18,8 @@ With `--physics mujoco`, the ants are trained with `physics: mujoco_euler` and c
 model and its integrator RK4: the columns `elsewhere_*` of results/certified_mujoco.csv.
 
 With `--map`, the methods that can fill a dominated map fill maps of these kinds, with as many slots as the grid has
-cells; results/certified_maps.csv has coverage and QD-score, too, which are counted by the same grid.
+cells; results/certified_maps.csv has coverage and QD-score, too, which are counted by the same grid. There is one task
+more, the maze of Kheperax: the configs are those of PointMaze, with what Kheperax's own example sets.
 """
 
 from __future__ import annotations
@@ -53,8 +55,20 @@ IN_C = {"ant_maze": "gymnasium:es_service/AntMazeMujoco-v0", "ant_trap": "gymnas
 """Task -> the same one in C MuJoCo."""
 MUJOCO_SEEDS = {"memes": 5, "nsra_es": 5, "me_es": 3, "map_elites": 3, "ars": 3}
 """Method -> number of its seeds in MuJoCo, which begin with 0."""
-KINDS = {"grid": ("map.kind=grid",), "dominated": ("map.kind=dominated", "map.slots=400")}
-"""Kind of a map -> settings of its runs."""
+SLOTS = {"point_maze": 400, "ant_maze": 400, "ant_trap": 400, "kheperax": 2500}
+"""Task -> cells of its grid, and slots of its dominated map."""
+KINDS = ("grid", "dominated")
+"""Kinds of maps."""
+ELSEWHERE = {
+    "kheperax": (
+        "task.environment=kheperax:standard",
+        "task.episode_steps=250",
+        "task.options.lasers_return_minus_one_if_out_of_range=true",
+        "policy.hidden=[8]",
+        "map.cells=[50,50]",
+    )
+}
+"""Task of a suite -> what makes it of a config of PointMaze."""
 MAPPED = ("me_es", *SHIPPED)
 """Methods that can fill each."""
 
@@ -113,7 +127,7 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
             "env_steps": int(then.env_steps),
             "seconds": round(float(then.wall_clock_s)),
         }
-        if {*wanted.settings}.intersection(kind for kind, *_ in KINDS.values()):
+        if {*wanted.settings}.intersection(f"map.kind={kind}" for kind in KINDS):
             of_run |= {name: float(then[name]) for name in COUNTED}
         rows.append(of_run | policy.row() | {"cpu": cpu_kind(), "commit": code})
     return pd.DataFrame(rows)
@@ -136,7 +150,14 @@ def keep(path: Path, rows: pd.DataFrame) -> bool:
 
 def config_of(task: str, method: str) -> Path:
     """The config of a method in the tables."""
+    task = "point_maze" if task in ELSEWHERE else task
     return (CONFIGS if method in SHIPPED else CONFIGS / "certified") / f"{task}_{method}.yaml"
+
+
+def settings_of(task: str, kind: str) -> tuple[str, ...]:
+    """Settings of a task's runs with a map of a kind, or with that of the config if there is no kind."""
+    slots = (f"map.slots={SLOTS[task]}",) if kind == "dominated" else ()
+    return (*ELSEWHERE.get(task, ()), *((f"map.kind={kind}", *slots) if kind else ()))
 
 
 def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
@@ -175,7 +196,7 @@ def maps_in_words(table: pd.DataFrame) -> str:
     lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     factors = {"return_mean": 1.0, "coverage": 100.0, "qd_score": 1e-3}
     for (task, method, settings), of_settings in table.groupby(["task", "method", "settings"], sort=True):
-        kind = next(kind for kind, (setting, *_) in KINDS.items() if setting in settings.split())
+        kind = next(kind for kind in KINDS if f"map.kind={kind}" in settings.split())
         for _, rows in of_settings.groupby("certification"):
             values = [_range(rows[column] * factor) for column, factor in factors.items()]
             steps = f"{rows.env_steps.min():.1e}".replace("e+0", "e")
@@ -205,7 +226,7 @@ def _number(value: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--task", nargs="+", default=list(TASKS), choices=(*TASKS, *ELSEWHERE))
     parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
     parser.add_argument("--seeds", metavar="A:B", help="default: 0:5, or those that the table in MuJoCo has")
     parser.add_argument("--physics", choices=("spring", "mujoco"), default="spring")
@@ -222,20 +243,21 @@ def main() -> None:
     if given.map and (trial or in_mujoco):
         parser.error("--map does not go with --config and --physics mujoco")
     settings = (*([EULER] if in_mujoco else []), *given.set)
-    tasks = [task for task in given.task if task in IN_C or not in_mujoco]
+    tasks = [task for task in given.task if task in (IN_C if in_mujoco else SLOTS if given.map else TASKS)]
     able = MUJOCO_SEEDS if in_mujoco else MAPPED if given.map else METHODS
     methods = [method for method in given.method if method in able]
     count = dict.fromkeys(METHODS, SEEDS) | (MUJOCO_SEEDS if in_mujoco else {})
-    chosen = [(given.config, SEEDS)] if trial else [(config_of(a, b), count[b]) for a in tasks for b in methods]
+    chosen = [("", given.config, SEEDS)] if trial else [(a, config_of(a, b), count[b]) for a in tasks for b in methods]
     wanted = [
-        Wanted(config, seed, tuple(given.marks), (*settings, *KINDS.get(kind, ())))
+        Wanted(config, seed, tuple(given.marks), (*settings, *settings_of(task, kind)))
         for seed in seeds_of(given.seeds or f"0:{SEEDS}")
         for kind in given.map or [""]
-        for config, most in chosen
+        for task, config, most in chosen
         if given.seeds or seed < most
     ]
     if not wanted:
-        parser.error(f"in MuJoCo there are {', '.join(MUJOCO_SEEDS)} on {' and '.join(IN_C)}")
+        of_maps = f"{', '.join(ELSEWHERE)} needs --map"
+        parser.error(f"in MuJoCo there are {', '.join(MUJOCO_SEEDS)} on {' and '.join(IN_C)}; {of_maps}")
     if not given.table:
         compute(missing(wanted, read(path)), run_one, lambda rows: keep(path, rows), RUNS)
     print(maps_in_words(read(path)) if given.map else in_words(read(path), "elsewhere_" if in_mujoco else ""))

@@ -3,9 +3,9 @@
     python -m tests.benchmarks.suites                             # those of the guide
     python -m tests.benchmarks.suites jumanji:Snake-v1 --batch 64
 
-Both step the same environments with the same random actions, without a policy, from a reset, which counts as well. They
-run by turns, and what counts is processor time, so that other programs make little difference. A row has the median of
-the rates, and the processor seconds until the code of each was compiled, that of xla without the time of tracing.
+Both step the same environments with the same random actions, without a policy, from states after a reset. They run by
+turns, and what counts is processor time, so that other programs make little difference. A row has the median of the
+rates, and the processor seconds in which the code of each was traced and compiled, that of the resets apart.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 
 STEPS, BATCH, TURNS = 100, 128, 5
 GUIDE = (
+    "craftax:Craftax-Classic-Symbolic-v1",
     "gymnax:Acrobot-v1",
     "gymnax:Breakout-MinAtar",
     "gymnax:CartPole-v1",
@@ -43,44 +44,41 @@ GUIDE = (
 def measured(name: str, batch: int) -> dict[str, Any]:
     """The row of a task."""
     import jax
-    import jax.numpy as jnp
-    import numpy as np
 
-    from es_service.protocol.noise import Domain, stream_keys
-    from workers.environments import describe_environment, make_environment
+    from workers.environments import describe_environment
+    from workers.rollouts.jax_tasks import random_steps
     from workers.simd.episodes.kernel import compile_kernel
     from workers.simd.graph.graph import UnsupportedError
 
-    task, environment = describe_environment(name), make_environment(name, {})
-    actions_T_A = np.random.default_rng(0).uniform(-1, 1, (STEPS, task.action_size)).astype(np.float32)
-    keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
-
-    def rewards(key: Any) -> Any:
-        def step(state: Any, action_A: Any) -> Any:
-            state, reward, _ = environment.step(state, action_A)
-            return state, (reward, jnp.sum(environment.observe(state)))
-
-        return jax.lax.scan(step, environment.reset(key), actions_T_A)[1]
-
+    task = describe_environment(name)
     row: dict[str, Any] = {"task": name, "observation": task.observation_size, "action": task.action_size}
-    lowered, begin = jax.jit(jax.vmap(rewards)).lower(keys), time.process_time()
-    compiled = lowered.compile()
-    row["xla_compile_s"] = time.process_time() - begin
-    sides: dict[str, Callable[[], Any]] = {"xla": lambda: jax.block_until_ready(compiled(keys))}
-    try:
-        begin = time.process_time()
-        kernel = compile_kernel(rewards, jax.ShapeDtypeStruct(keys.shape[1:], jnp.uint32))
-        row["simd_compile_s"] = time.process_time() - begin
-        sides["simd"] = lambda: kernel(keys)
-    except UnsupportedError as error:
-        row["simd_refuses"] = str(error)
+
+    def by_xla(episode: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+        batched = jax.tree.map(lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), shapes)
+        return jax.jit(jax.vmap(episode)).lower(*batched).compile()
+
+    def timed(side: str, compiler: Callable[..., Any]) -> Callable[..., Any]:
+        def compiled(*arguments: Any) -> Any:
+            begin = time.process_time()
+            code = compiler(*arguments)
+            row[f"{side}_compile_s"] = time.process_time() - begin
+            return code
+
+        return compiled
+
+    sides: dict[str, Callable[[int], int]] = {}
+    for side, compiler in ("xla", by_xla), ("simd", compile_kernel):
+        try:
+            sides[side] = random_steps(timed(side, compiler), task, {}, batch, STEPS)
+        except UnsupportedError as error:
+            row["simd_refuses"] = str(error)
     rates: dict[str, list[float]] = {side: [] for side in sides}
     for turn in range(TURNS + 1):
         for side, run in sides.items():
             begin = time.process_time()
-            run()
+            steps = run(turn)
             if turn:  # the first warms up
-                rates[side].append(batch * STEPS / (time.process_time() - begin))
+                rates[side].append(steps / (time.process_time() - begin))
     return row | {f"{side}_steps_per_s": statistics.median(found) for side, found in rates.items()}
 
 
@@ -96,7 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cache = tempfile.TemporaryDirectory()  # so that simd compiles all
     one_thread = {"PJRT_NPROC": "1", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
-    os.environ |= one_thread | {"XDG_CACHE_HOME": cache.name}
+    os.environ |= one_thread | {"XDG_CACHE_HOME": cache.name, "JAX_COMPILATION_CACHE_DIR": cache.name}
     with arguments.out.open("a") if arguments.out else sys.stdout as file:
         writer = csv.DictWriter(file, COLUMNS)
         if not arguments.out or not file.tell():

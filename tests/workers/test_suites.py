@@ -223,11 +223,34 @@ GYMNAX = ["CartPole-v1", "Pendulum-v1", "MountainCar-v0", "Acrobot-v1", "Breakou
 
 def compared(name: str, own: Callable[[Any], Any], numbers: np.ndarray, within: float, by_simd: float = 0.0) -> None:
     """Compare the first steps of a task by xla, and by simd if a tolerance is given, with those of a suite's own."""
-    ours = steps_of(make_environment(name, {}), numbers)
+    environment = make_environment(name, {})
     wanted = jax.jit(jax.vmap(own))(keys())
-    compare(jax.jit(jax.vmap(ours))(keys()), wanted, within)
+    compare(jax.jit(jax.vmap(steps_of(environment, numbers)))(keys()), wanted, within)
     if by_simd:
-        compare(compile_kernel(ours, jax.ShapeDtypeStruct((4,), jnp.uint32))(keys()), wanted, by_simd)
+        compare(simds_steps(environment, numbers), wanted, by_simd)
+
+
+def simds_steps(environment: Any, actions_T_A: np.ndarray) -> Any:
+    """What `steps_of` gives for each key, by code of a single step, since simd would unroll a scan."""
+
+    def shapes(given: Any) -> Any:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), given)
+
+    def step(state: Any, action_A: Any) -> Any:
+        state, reward, done = environment.step(state, action_A)
+        return state, (environment.observe(state), reward, done)
+
+    def begin(key: Any) -> Any:
+        state = environment.reset(key)
+        return state, environment.observe(state)
+
+    state, first = compile_kernel(begin, shapes(keys()))(keys())
+    actions_T_L_A = np.repeat(actions_T_A[:, None], SEEDS, axis=1)
+    kernel, seen = compile_kernel(step, shapes(state), shapes(actions_T_L_A[0])), []
+    for action_L_A in actions_T_L_A:
+        state, after = kernel(state, action_L_A)
+        seen.append(after)
+    return first, jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *seen)
 
 
 def random_numbers(size: int) -> np.ndarray:
@@ -305,13 +328,15 @@ def test_the_target_and_the_four_quarters_of_a_kheperax_maze() -> None:
     assert environment.success(state, True)
 
 
-JUMANJI = ("Snake-v1", "Game2048-v1", "Minesweeper-v0", "RubiksCube-v0", "Cleaner-v0", "SearchAndRescue-v0")
+JUMANJI = {"Snake-v1": True, "Game2048-v1": True, "Minesweeper-v0": True, "RubiksCube-v0": True, "Cleaner-v0": True,
+           "SearchAndRescue-v0": False}  # fmt: skip
+"""Environment -> whether simd is to compile it."""
 
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # Jumanji's own
 @pytest.mark.parametrize("name", JUMANJI)
-def test_the_first_steps_of_jumanji_are_its_own(name: str) -> None:
+def test_the_first_steps_of_jumanji_are_its_own_and_simds(name: str) -> None:
     jumanji = pytest.importorskip("jumanji")
     own, task = jumanji.make(name), describe_environment(f"jumanji:{name}")
     numbers = random_numbers(task.action_size)
@@ -342,7 +367,42 @@ def test_the_first_steps_of_jumanji_are_its_own(name: str) -> None:
         carried = jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), carried, shapes)
         return flat(timestep.observation), jax.lax.scan(step, carried, numbers)[1]
 
-    compared(f"jumanji:{name}", of_jumanji, numbers, 1e-6)
+    tolerance = 1e-6 if JUMANJI[name] else 1e-5  # places and distances, which XLA rounds otherwise alone
+    compared(f"jumanji:{name}", of_jumanji, numbers, tolerance, 2e-4 * JUMANJI[name])
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore")  # Craftax's own
+def test_the_first_steps_of_craftax_are_its_own() -> None:
+    module = pytest.importorskip("craftax.craftax_env")
+    name = "Craftax-Classic-Symbolic-v1"
+    own, task = module.make_craftax_env_from_name(name, auto_reset=False), describe_environment(f"craftax:{name}")
+    assert (task.observation_size, task.action_size, task.episode_steps) == (1345, 17, 10_000)
+    assert (task.descriptor_names, task.descriptor_bounds) == (("achievements",), ((0.0, 22.0),))
+    numbers = random_numbers(task.action_size)
+
+    def of_craftax(key: Any) -> Any:
+        def step(state: Any, given: Any) -> Any:
+            number, action = given
+            observation, state, reward, done, _ = own.step(jax.random.fold_in(key[:2], number), state, action)
+            return state, (observation, reward, done)
+
+        observation, state = own.reset(jax.random.fold_in(key[:2], 0))
+        shapes = jax.eval_shape(lambda state: step(state, (1, 0))[0], state)
+        state = jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), state, shapes)
+        return observation, jax.lax.scan(step, state, (np.arange(1, STEPS + 1), np.argmax(numbers, 1)))[1]
+
+    compared(f"craftax:{name}", of_craftax, numbers, 1e-6)
+
+
+def test_textures_of_craftax_that_cannot_be_kept_are_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("craftax")
+    from workers.environments.craftax_task import _constants
+
+    constants = _constants("craftax.craftax_classic")
+    monkeypatch.setattr(constants, "TEXTURE_CACHE_FILE", "/proc/no/such/folder")
+    monkeypatch.setattr(constants, "load_all_textures_given_size", lambda size: size)
+    assert constants.load_all_textures.__wrapped__()
 
 
 @pytest.mark.slow
@@ -371,6 +431,23 @@ def test_the_first_steps_of_playground_are_its_own_and_simds(name: str) -> None:
     compared(f"playground:{name}", of_playground, actions, 1e-3, 1e-2)
 
 
+@pytest.mark.slow
+def test_a_descriptor_of_playground_is_where_c_mujoco_has_a_body() -> None:
+    registry = pytest.importorskip("mujoco_playground").registry
+    mujoco = pytest.importorskip("mujoco")
+    options = {"descriptor": ["position_pole_1"]}
+    task = describe_environment("playground:CartpoleBalance", {"options": options})
+    assert task.descriptor_names == tuple(f"position_pole_1_{number}" for number in range(3))
+    environment = make_environment("playground:CartpoleBalance", options)
+    state = jax.jit(environment.reset)(keys()[0])
+    model = registry.load("CartpoleBalance", config_overrides={"impl": "jax"}).mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(state.suite.data.qpos)
+    mujoco.mj_kinematics(model, data)
+    assert abs(data.body("pole_1").xpos[0]) > 1e-4  # the cart is not in the middle
+    np.testing.assert_allclose(environment.descriptor(state), data.body("pole_1").xpos, atol=1e-6)
+
+
 def compare(found: Any, wanted: Any, tolerance: float = 2e-4) -> None:
     """Compare observations, rewards and ends until each episode's end, after which the two go on differently."""
     (first, (seen, reward, done)), (own_first, (own_seen, own_reward, own_done)) = (
@@ -385,22 +462,25 @@ def compare(found: Any, wanted: Any, tolerance: float = 2e-4) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "module", "steps", "least"),
-    [("gymnax:CartPole-v1", "gymnax", 500, 475.0), ("playground:CartpoleBalance", "mujoco_playground", 500, 450.0)],
+    ("name", "module", "share"),
+    [("gymnax:CartPole-v1", "gymnax", 0.95), ("playground:CartpoleBalance", "mujoco_playground", 0.9)],
 )
 def test_es_learns_the_cartpole_of_each_suite_that_has_one(
-    name: str, module: str, steps: int, least: float, tmp_path: Path
+    name: str, module: str, share: float, tmp_path: Path, noticed: list[str]
 ) -> None:
-    """By the lower end of the interval of new episodes. Gymnasium calls a mean of 475 solved."""
+    """By the lower end of the interval of new episodes, as a share of the greatest return, since rewards are at most 1.
+    Gymnasium calls 95 % of the first one solved; the second one's reward falls with each force and each angle."""
     pytest.importorskip(module)
+    steps = 500
     search = {"algorithm": "es", "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.2, "l2": 0}}
     config = {
         "task": {"environment": name, "episode_steps": steps},
         "policy": {"hidden": [8]},
         "search": search | {"evaluation_episodes": 8},
         "map": {"enabled": False},
-        "budget": {"generations": 20},
+        "budget": {"generations": 60},
     }
     trained = run(config, tmp_path / "run", progress=False).run
+    assert all("compiling" in line for line in noticed)
     [certified] = certify_run(trained.folder, top=0, episodes=64)
-    assert certified.row()["return_low"] >= least
+    assert certified.row()["return_low"] >= share * steps

@@ -3,7 +3,7 @@
 They are Playground's own: its models, with the iterations of the solver and the limits of contacts that it sets. The
 tasks of the DM Control suite are part of its package. Those of locomotion and manipulation need the models of
 mujoco_menagerie, which Playground clones by git into its own folder when such an environment is made for the first
-time.
+time. Measures are its metrics, and `position_NAME`, the place of each body that has a name.
 """
 
 from __future__ import annotations
@@ -48,6 +48,12 @@ def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
         after = environment.step(state, action)  # its key is in state.info
         return after, observed(after), after.reward, jnp.asarray(after.done) > 0.5
 
+    bodies = {environment.mj_model.body(number).name: number for number in range(1, environment.mj_model.nbody)}
+    bodies.pop("", None)
+
+    def measures(state: Any) -> dict[str, Any]:
+        return {**state.metrics, **{f"position_{name}": state.data.xpos[number] for name, number in bodies.items()}}
+
     size = int(environment.action_size)
     return Suite(
         f"playground:{name}",
@@ -56,7 +62,7 @@ def suite(name: str, given: Mapping[str, OptionValue]) -> Suite:
         Actuators(np.full(size, -1.0), np.ones(size)),
         int(environment._config.episode_length),
         {"observation": choice(*OBSERVATIONS)} if has_kinds else {},
-        measures=lambda state: state.metrics,
+        measures=measures,
     )
 
 

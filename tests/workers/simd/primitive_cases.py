@@ -406,6 +406,10 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "exponentials": unary(lambda x: (jnp.exp(x), jnp.expm1(x), jnp.exp2(x), jnp.tanh(x), jax.nn.sigmoid(x))),
     "logarithms": unary(lambda x: (jnp.log(x), jnp.log1p(x)), 0.01, 9.0),
     "pow": lambda draw: (jnp.power, [floats(draw, (3,), 0.1, 3.0), floats(draw, (3,))]),
+    "pow of whole numbers": lambda draw: (
+        lambda x, n: lax.pow(x, n % 9 - 4),
+        [floats(draw, (3,), 0.1, 3.0), integers(draw, (3,))],
+    ),
     "clamp": lambda draw: (lambda x: jnp.clip(x, -1.0, 1.5), [special(draw, (4,))]),
     "lax.clamp": lambda draw: (lambda x: lax.clamp(np.float32(-1), x, np.float32(2)), [floats(draw, (4,))]),
     "of nothing": lambda draw: (

@@ -135,8 +135,17 @@ def _elementary(function: Callable[..., int]) -> PrimitiveRule:
 
 
 for _name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "exp2", "expm1", "log", "log1p", "tanh",
-              "logistic", "rsqrt", "pow", "erf_inv"):  # fmt: skip
+              "logistic", "rsqrt", "erf_inv"):  # fmt: skip
     PRIMITIVES[_name] = _elementary(getattr(elementary, _name))
+
+
+@primitive("pow")
+def _pow(t: Tracer, equation: Any, x: Nodes, exponent: Nodes) -> Nodes:
+    """A whole exponent is converted, as XLA does."""
+    base, power = (str(variable.aval.dtype) for variable in equation.invars)
+    if base != "float32" or power not in ("float32", "int32"):
+        raise UnsupportedError(f"pow of {[base, power]}")
+    return t.map(lambda *nodes: elementary.pow(t.graph, *nodes), x, to_float(t, power, exponent))
 
 
 @primitive("eq", "ne", "lt", "le", "gt", "ge")
