@@ -461,26 +461,24 @@ def compare(found: Any, wanted: Any, tolerance: float = 2e-4) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "module", "share"),
-    [("gymnax:CartPole-v1", "gymnax", 0.95), ("playground:CartpoleBalance", "mujoco_playground", 0.9)],
-)
-def test_es_learns_the_cartpole_of_each_suite_that_has_one(
-    name: str, module: str, share: float, tmp_path: Path, noticed: list[str]
-) -> None:
-    """By the lower end of the interval of new episodes, as a share of the greatest return, since rewards are at most 1.
-    Gymnasium calls 95 % of the first one solved; the second one's reward falls with each force and each angle."""
-    pytest.importorskip(module)
+def test_es_learns_a_cartpole(tmp_path: Path, noticed: list[str]) -> None:
+    """By the lower end of the interval of new episodes: Gymnasium calls 95 % of the greatest return solved."""
+    pytest.importorskip("gymnax")
     steps = 500
-    search = {"algorithm": "es", "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.2, "l2": 0}}
     config = {
-        "task": {"environment": name, "episode_steps": steps},
+        "task": {"environment": "gymnax:CartPole-v1", "episode_steps": steps},
         "policy": {"hidden": [8]},
-        "search": search | {"evaluation_episodes": 8},
+        "search": {
+            "algorithm": "es",
+            "pairs": 16,
+            "sigma": 0.2,
+            "step": {"learning_rate": 0.2, "l2": 0},
+            "evaluation_episodes": 8,
+        },
         "map": {"enabled": False},
-        "budget": {"generations": 60},
+        "budget": {"generations": 20},
     }
     trained = run(config, tmp_path / "run", progress=False).run
     assert all("compiling" in line for line in noticed)
     [certified] = certify_run(trained.folder, top=0, episodes=64)
-    assert certified.row()["return_low"] >= share * steps
+    assert certified.row()["return_low"] >= 0.95 * steps
