@@ -143,10 +143,11 @@ def table() -> str:
     """The tables of the guides."""
     lines = [f"| task | simd, control steps/s | {' | '.join(f'/ {side}' for side in SIDES.values())} |"]
     lines.append("|" + " --- |" * (2 + len(SIDES)))
-    for row in pd.read_csv(RATES).to_dict("records"):
+    for row in pd.read_csv(RATES).sort_values("cpu", ascending=False, kind="stable").to_dict("records"):
         parts = [[row.get(f"{part}_{side}", np.nan) for part in ("times", "least", "most")] for side in SIDES]
         cells = ["-" if np.isnan(times[0]) else "{:.3g} ({:.3g} to {:.3g})".format(*times) for times in parts]
-        lines.append(f"| {row['task']} | {row['simd']:,.0f} | {' | '.join(cells)} |")
+        title = f"{row['task']}, AVX2" if row["cpu"].endswith("avx2") else row["task"]
+        lines.append(f"| {title} | {row['simd']:,.0f} | {' | '.join(cells)} |")
     found = pd.read_csv(ITERATIONS)
     numbers = sorted(set(found["iterations"]))
     lines += [
