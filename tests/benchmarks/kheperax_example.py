@@ -3,8 +3,8 @@
     python -m tests.benchmarks.kheperax_example --seeds 0:3
 
 The settings are those of its notebook (batches of 2,048, isoline variation with 0.2 and 0.0, a grid of 50 x 50, a
-policy with 8 units), which evaluates 1e6 policies in 250 steps each. Coverage counts all cells; the QD-score counts from
-the least return that the maze allows, as ours does. A row for each seed and number of evaluations is in
+policy with 8 units), which evaluates 1e6 policies in 250 steps each. Coverage counts all cells. The QD-score is from
+the least return that the maze allows on, as ours is. A row for each seed and number of evaluations is in
 results/kheperax_example.csv. Needs the extra `kheperax`.
 """
 
@@ -53,6 +53,7 @@ def rows(seed: int, marks: Sequence[int]) -> list[dict[str, Any]]:
         variation_percentage=1.0,
         batch_size=BATCH,
     )
+
     def scored(genotypes: Any, key: Any) -> Any:  # as QDax 0.5.0 has it: without a new key
         return score(genotypes, key)[:3]
 
