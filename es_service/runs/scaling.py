@@ -88,12 +88,12 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     works = [_work(phase, centres, spec, config) for phase in phases]
     initial = [(replace(centres[0], archive=None), chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
     chunk_s, answers = _chunk_costs(spec, [*works, initial])
-    message_s, way_s, chunk_message_s = _message_costs(spec, works, answers)
+    message_s, way_s, chunk_message_s = message_costs(spec, works, answers)
     costs = Costs(chunk_s, message_s, way_s, *_driver_cost(config, answers), chunk_message_s)
     steps = _steps(search, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
-        prediction = predict(phases, costs, count // cores, cores, partial(_longest_part, cores=cores))
+        prediction = predict(phases, costs, count // cores, cores, partial(longest_part, cores=cores))
         yield {
             "workers": count,
             "seconds_per_generation": round(prediction.seconds, 6),
@@ -172,7 +172,7 @@ def _steps(search: SearchConfig, answers: Mapping[str, ChunkResult]) -> float:
     )
 
 
-def _longest_part(chunks: int, cores: int) -> float:
+def longest_part(chunks: int, cores: int) -> float:
     """Number of chunks that the busiest core of an actor runs, when cores take the next part as they become free."""
     free = [0] * cores
     for part in parts(range(chunks), cores):
@@ -227,7 +227,7 @@ class EchoActor(WorkerActor):
         return platform_text({})
 
 
-def _message_costs(
+def message_costs(
     spec: WorkerSpec, works: Sequence[Sequence[Work]], answers: Mapping[str, ChunkResult]
 ) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
     """(seconds of the driver per work item of one chunk, seconds of an item's way to a worker, seconds of the driver
