@@ -222,7 +222,7 @@ def test_a_capsule_touches_a_cylinder_where_it_does_in_c_mujoco():
         if data.ncon == 1 and data.contact[0].dist > -0.01:
             (contact,) = data.contact
             rows.append((np.float32(data.qpos), contact.dist, contact.pos.copy(), contact.frame[:3].copy()))
-    assert 0 < two < 20
+    assert 0 < two < 50, "most have one; before MuJoCo 4 there are twice as many with two"
 
     def touch(qpos: Any) -> tuple[Any, Any, Any]:
         found: Any = mujoco_parts.forward(mx, mujoco_parts.start(mx, qpos), np.zeros(0))

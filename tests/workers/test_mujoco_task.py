@@ -313,7 +313,7 @@ def test_a_short_training_of_the_arm_is_certified_to_be_better_than_a_random_pol
     )
     run = api.run(config, tmp_path / "arm", progress=False).run
     [trained] = certify_run(run.folder, top=0, episodes=64)
-    random_N_D = 0.3 * np.random.default_rng(0).normal(size=(4, trained.parameters_D.size))
+    random_N_D = 0.3 * np.random.default_rng(0).normal(size=(4, trained.policy.parameters_D.size))
     random = certify(random_N_D, config, episodes=64, keep=4)
     print("\n", trained.row()["return_low"], [one.row()["return_high"] for one in random])
     assert trained.row()["return_low"] > max(one.row()["return_high"] for one in random)
