@@ -30,7 +30,7 @@ from workers.viewer import Viewer
 #
 # Versions are pinned in constraints.txt, and tests compare the physics of the ants with Brax's.
 
-WORKS_WITH = {"brax": ("0.14.",), "mujoco": ("3.16.", "3.17.", "4.0."), "mujoco-mjx": ("3.16.", "3.17.")}
+WORKS_WITH = {"brax": ("0.14.",), "mujoco": ("3.17.", "4.0."), "mujoco-mjx": ("3.17.",)}
 """Prefixes of the versions with which the physics was compared with Brax's; each MJX release may break Brax."""
 
 
