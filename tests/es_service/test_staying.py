@@ -163,8 +163,9 @@ def test_seconds_of_processors_are_those_for_a_run_also_while_the_processes_of_o
             run(FUNCTION | {"seed": 3}, tmp_path / "three")
             _, other = started
             assert other.is_running
-            assert other.cpu_s > 0.2, "it has started Python"
-            assert transport.cpu_s() - time.process_time() - started[0].cpu_s == pytest.approx(before_s, abs=0.1)
+            assert other.cpu_s > 0.02, "it has started Python"
+            used_s = transport.cpu_s() - time.process_time() - started[0].cpu_s
+            assert used_s == pytest.approx(before_s, abs=other.cpu_s / 2), "without the other's"
         begun_s, driver_s = other.cpu_s + started[0].cpu_s, time.process_time()
         again = run(FUNCTION, tmp_path / "four")
         used_s = time.process_time() - driver_s + other.cpu_s + started[0].cpu_s - begun_s
@@ -178,8 +179,8 @@ def test_a_process_that_has_ended_says_how_long_it_computed():
     child.call("shell")
     child.call(busy)
     before_s = child.cpu_s
-    assert before_s > 0.2, "with what it has started"
-    assert child.end().cpu_s == child.cpu_s == pytest.approx(before_s, abs=0.1)
+    assert before_s > 0.05, "with what it has started"
+    assert child.end().cpu_s == child.cpu_s == pytest.approx(before_s, abs=before_s / 2)
 
 
 def test_blocks_can_be_nested_and_overlap_in_threads(tmp_path, started):
