@@ -32,7 +32,7 @@ from es_service.config.keys import (
 from es_service.config.model import ConfigOrigin, Kept, RunConfig, nested, replaces
 from es_service.config.parts import TASK_OPTIONS, as_tuple
 from es_service.config.resolution import Unknown, Values, asks
-from es_service.config.rules import METHOD_RULES, RULES, START_RULES, problems_of, unknown_output
+from es_service.config.rules import METHOD_RULES, RULES, START_RULES, TASK_RULES, problems_of, unknown_output
 from es_service.config.search import SearchConfig, preset_rows
 from es_service.config.tasks import CHOICES, OTHER_TASKS, Tasks, read_options, settings_of_task
 from es_service.config.text import meant_task, nearest, one_of, problem_of, show
@@ -167,6 +167,9 @@ def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> 
     given = {**defaults, **file, **wanted}
     task, settings, unknown = _chosen(given, unusable, known)
     if settings is not None:
+        if _is_replaced("task.environment", file, wanted) and task is not None:
+            left_out |= (refused := _refused_by_task(file, wanted, task, settings, known))
+            file, given = _without(file, refused), _without(given, refused)
         chosen = Values(given, task, settings, known.rollouts)
         left_out |= (others := _of_another_method(file, wanted, chosen, settings, known.algorithms))
         file, given = _without(file, others), _without(given, others)
@@ -247,13 +250,36 @@ def _of_another_task(file: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict
     """See `ConfigOrigin.left_out`: what goes with a task that overrides replace."""
     if not _is_replaced("task.environment", file, wanted):
         return {}
-    why = f"{wanted['task.environment']} replaces its task"
 
     def is_of_task(key: str) -> bool:
         is_target = key.startswith("budget.target_") and file[key] is not None  # a fitness, which is that of its task
-        return is_target or key.startswith(TASK_OPTIONS) or key in CHOICES
+        has_units = key == "map.bounds" and not asks(key, file[key])  # those of its task's descriptor
+        return is_target or has_units or key.startswith(TASK_OPTIONS) or key in CHOICES
 
-    return {key: why for key in file if key not in wanted and is_of_task(key)}
+    return {key: _replaces_task(wanted) for key in file if key not in wanted and is_of_task(key)}
+
+
+def _replaces_task(wanted: Mapping[str, Any]) -> str:
+    return f"{wanted['task.environment']} replaces its task"
+
+
+def _refused_by_task(
+    file: Mapping[str, Any], wanted: Mapping[str, Any], task: TaskSpec, settings: type[SearchConfig], known: Known
+) -> dict[str, str]:
+    """See `ConfigOrigin.left_out`: what a task that overrides replace allowed, and the new one does not, such as noise
+    on actions that are now choices. One such value may hide another."""
+    why = _replaces_task(wanted)
+    left_out = {key: why for key in file if key not in wanted and _is_idle(key, task, None)}
+    while True:
+        given = {
+            key: value for key, value in {**file, **wanted}.items() if key not in left_out and not asks(key, value)
+        }
+        invalid = value_problems(given, settings, known.algorithms)
+        values = Values(given, task, settings, known.rollouts, invalid)
+        refused = {problem.field for problem in problems_of(values, TASK_RULES)} & {*file} - {*wanted, *left_out}
+        if not refused:
+            return left_out
+        left_out |= {key: why for key in file if key in refused}
 
 
 def _of_another_method(

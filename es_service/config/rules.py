@@ -14,7 +14,7 @@ from typing import Any
 
 from es_service.config.given import start_of
 from es_service.config.keys import BUDGET, FIELDS
-from es_service.config.map_rules import MAP_RULES
+from es_service.config.map_rules import MAP_RULES, cells_fit
 from es_service.config.parts import RESOURCES, TASK_OPTIONS
 from es_service.config.resolution import Unknown, Values, only_centres
 from es_service.config.search import SearchConfig
@@ -354,6 +354,16 @@ def run_ends(config: Values, task: TaskSpec) -> Problems:
         yield problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}")
 
 
+TASK_RULES: tuple[Rule, ...] = (
+    fitness_fits,
+    recycling_is_for_processes_of_users,
+    time_limit_is_for_steps_of_unequal_times,
+    times_are_measured,
+    low_rank_noise_needs_matrices,
+    output_fits,
+    cells_fit,
+)
+"""Rules of what a task allows: if overrides replace the task of a file, values against them are left out."""
 METHOD_RULES: tuple[Rule, ...] = (
     centres_fit_the_method,
     statistics_need_training,

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
+from es_service import api
 from es_service.config.changes import changed_constants, refused_changes
+from es_service.config.given import shipped_configs
 from es_service.config.model import RECYCLING, RunConfig
 from es_service.config.text import parse_value
 from es_service.errors import ConfigError
@@ -89,6 +93,37 @@ def test_another_task_has_its_own_default_options():
         assert left_out(source, same, **other) == {}
     with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has physics"):
         load_config(source, ["task.environment=ant_maze", "task.options.start=corner"], **other)
+
+
+@pytest.mark.parametrize(
+    "task", ["gymnasium:CartPole-v1", "gymnasium:Pendulum-v1", "point_maze", "function:tests.workers.functions:hill"]
+)
+def test_any_task_can_replace_that_of_any_shipped_config(task):
+    for name in shipped_configs():
+        config = api.load_config(name, [f"task.environment={task}"])
+        assert {*config.made.left_out.values()} <= {f"{task} replaces its task"}
+    config = api.load_config("point_maze_es", ["task.environment=gymnasium:CartPole-v1", "policy.output=categorical"])
+    assert (config.policy.action_noise, config.policy.output) == (0.0, "categorical")
+
+
+def test_what_another_task_forbids_goes_with_its_task_unless_it_is_asked_for():
+    source = MINIMAL | {"policy": {"output": "linear", "action_noise": 0.1}, "map": {"cells": [9, 9], "kind": "grid"}}
+    source |= {"task": {"environment": "point_maze", "fitness": "final"}}
+    there = "task.environment=gymnasium:CartPole-v1"
+    gone = ["map.cells", "policy.action_noise", "policy.output", "task.fitness"]
+    assert sorted(api.load_config(source, [there]).made.left_out) == gone
+    for key, value in {"map.cells": "[9, 9]", "policy.output": "tanh", "task.fitness": "final"}.items():
+        with pytest.raises(ConfigError, match=re.escape(f"{key}: ")):
+            api.load_config(source, [there, f"{key}={value}"])
+    with pytest.raises(ConfigError, match=r"policy\.action_noise: quiet"):
+        api.load_config(source | {"policy": {"action_noise": "quiet"}}, [there])
+
+
+def test_bounds_of_a_descriptor_go_with_its_task():
+    source = MINIMAL | {"map": {"bounds": [[0.0, 1.0], [0.0, 1.0]]}}
+    config = api.load_config(source, ["task.environment=ant_trap"])
+    assert (list(config.made.left_out), config.map.bounds) == (["map.bounds"], ((0.0, 30.0), (-8.0, 8.0)))
+    assert api.load_config(source, ["task.environment=point_maze"]).map.bounds == ((0.0, 1.0), (0.0, 1.0))
 
 
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:
