@@ -142,15 +142,15 @@ def descriptions(name: str, settings: Mapping[str, Any]) -> Callable[[str], Any]
 
 
 def members(suite: str) -> Callable[[str], str]:
-    """Function that answers "" with the names of a suite's environments, as JSON, and a name with the fields of its
-    TaskSpec; either way, with {"problem": text} if it cannot. Whether simd can compile it is not tried."""
+    """Function that answers "" with the names of a suite's environments, as JSON, and `SUITE:NAME` with the fields of
+    its TaskSpec; either way, with {"problem": text} if it cannot. Whether simd can compile it is not tried."""
     from workers.environments.suite_task import adapter
 
     def answer(name: str) -> str:
         try:
             if not name:
                 return json.dumps({"names": adapter(suite).names()})
-            return json.dumps({"task": dataclasses.asdict(describe_environment(f"{suite}:{name}"))})
+            return json.dumps({"task": dataclasses.asdict(describe_environment(name))})
         except TaskError as error:
             return json.dumps({"problem": str(error)})
 

@@ -247,7 +247,7 @@ def print_header(console: Console, run_width: int | None = None) -> None:
 def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_width: int | None = None) -> None:
     """Print the line of a policy, of which `names` are the descriptor's dimensions."""
     run = "" if run_width is None else f"{row['run']:<{run_width}}  "
-    values = f"{row['stored_fitness']:>10.2f} {row['fresh_fitness']:>10.2f} {row['fresh_standard_error']:>8.2f}"
+    values = f"{row['stored_fitness']:>z10.2f} {row['fresh_fitness']:>z10.2f} {row['fresh_standard_error']:>8.2f}"
     success = "-" if row["successes"] is None else f"{row['successes']}/{row['episodes']}"
     where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
     print_line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values} {success:>11}  {where}")

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -153,13 +153,25 @@ def list_(
         print_catalogue(console, TASKS)
 
 
+LIBRARIES = ("brax", "gymnasium", "mujoco")
+"""Prefixes of tasks that are those of a library, and not of a suite."""
+
+
 def list_suite(suite: str, as_json: bool) -> None:
-    """Print the environments of a suite with their sizes, each as soon as it is known."""
+    """Print the names of a suite's environments, and then their sizes, each as soon as it is known."""
+    if suite in LIBRARIES:
+        what = f"{suite} is no suite, and has environments of its own by {suite}:NAME"
+        raise ConfigError(f"--suite {suite}: {what}; {command('help', 'other_suites')} has them")
     if suite not in SUITES:
         hint = did_you_mean(suite, SUITES)
         raise ConfigError(f"--suite {suite}: there is no such suite; must be {one_of(SUITES)}{hint}")
+
+    def show_names(names: Sequence[str]) -> None:
+        if not as_json:
+            print_line(console, f"{len(names)} environments: {', '.join(names)}\n")
+
     rows = []
-    for name, task in tasks_of_suite(suite):
+    for name, task in tasks_of_suite(suite, show_names):
         rows.append(asdict(task) if isinstance(task, TaskSpec) else {"name": name, "problem": task})
         if not as_json:
             print_line(console, name, style="bold")

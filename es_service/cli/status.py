@@ -151,9 +151,9 @@ def _progress(status: RunStatus) -> dict[str, str]:
         target += f" (certified target: {status.target_certified:g})"
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
-        "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
+        "best fitness": f"{last['best_fitness']:z.2f}{target}; selected, not certified",
         **({"certified target": failed_sentence(status.tries)} if status.tries else {}),
-        f"{nouns[0]} fitness": f"{last['centre_fitness_mean']:.2f}{spread}",
+        f"{nouns[0]} fitness": f"{last['centre_fitness_mean']:z.2f}{spread}",
         **goal,
         **filled,
         "novelty archive": counted(last["archive_size"], *nouns),
@@ -277,7 +277,7 @@ def _signed(value: float) -> str:
 
 def _interval(row: Mapping[str, Any], name: str) -> str:
     mean, low, high = (row[f"{name}_{end}"] for end in ("mean", "low", "high"))
-    return f"{mean:,.2f} [{low:,.2f}, {high:,.2f}]"
+    return f"{mean:z,.2f} [{low:z,.2f}, {high:z,.2f}]"
 
 
 # The command, and the line of each of several runs.
@@ -406,7 +406,7 @@ def _row(status: RunStatus) -> tuple[str, ...]:
         *who,
         f"{row['generation']:,}" + (f" of {generations:,}" if generations else ""),
         short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
-        f"{row['best_fitness']:.2f}",
+        f"{row['best_fitness']:z.2f}",
         f"{row['map_cells']:,}" if "map_cells" in row else "-",
         state(status),
     )

@@ -394,7 +394,7 @@ def live_table(title: str, runs: Sequence[SweptRun], width: int, height: int) ->
         "run": lambda run: run.name,
         "state": lambda run: run.state,
         "generation": lambda run: _of(run, "generation", "generations"),
-        "best": lambda run: f"{run.row['best_fitness']:.2f}" if run.row else "-",
+        "best": lambda run: f"{run.row['best_fitness']:z.2f}" if run.row else "-",
         "env steps": lambda run: _of(run, "env_steps", "env_steps"),
         "steps/s": lambda run: short(run.row["steps_per_second"]) if run.row and run.state == "running" else "-",
         "cells": lambda run: str(run.row["map_cells"]) if run.row and "map_cells" in run.row else "-",

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from typing import Any, TypeGuard
@@ -220,11 +220,12 @@ def _ask_for_description(name: str, settings: str) -> dict[str, Any]:
     return answer["task"]
 
 
-def tasks_of_suite(suite: str) -> Iterator[tuple[str, TaskSpec | str]]:
+def tasks_of_suite(suite: str, on_names: Callable[[Sequence[str]], None]) -> Iterator[tuple[str, TaskSpec | str]]:
     """Name of each environment of a suite, and its description, or why it cannot be a task.
 
     Args:
         suite: one of `sources.SUITES`.
+        on_names: is called with all names before the first description, which may take seconds.
 
     Raises:
         ConfigError: the suite is not installed, or its process ended.
@@ -235,9 +236,11 @@ def tasks_of_suite(suite: str) -> Iterator[tuple[str, TaskSpec | str]]:
             listed = json.loads(child.call("", limit_s=DESCRIBE_S))
             if "problem" in listed:
                 raise ConfigError(listed["problem"])
-            for name in listed["names"]:
+            names = [f"{suite}:{name}" for name in listed["names"]]
+            on_names(names)
+            for name in names:
                 answer = json.loads(child.call(name, limit_s=DESCRIBE_S))
-                yield f"{suite}:{name}", answer.get("problem") or task_from_fields(answer["task"])
+                yield name, answer.get("problem") or task_from_fields(answer["task"])
         except (NoAnswerError, RaisedError) as error:
             raise ConfigError(f"the environments of {suite} could not be described: {error}") from None
         child.end(END_S)

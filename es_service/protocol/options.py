@@ -30,12 +30,15 @@ class Option:
 
     default: OptionValue | None
     """None: no value unless one is given, which may be any plain one. Only our own tasks have such options: those of
-    Gymnasium, whose environments then have what they have by themselves, and the start of a caller's episodes."""
+    Gymnasium, whose environments then have what they have by themselves, descriptors of suites, and the start of a
+    caller's episodes."""
     low: int | float | None = None
     high: int | float | None = None
     """Least and greatest value of a number, both allowed; None for no bound."""
     choices: tuple[OptionValue, ...] = ()
     """The only allowed values; empty if there are others."""
+    words: str = ""
+    """What is allowed, in words, where type and bounds do not say it."""
 
 
 def choice(*values: OptionValue) -> Option:
@@ -115,6 +118,8 @@ def allowed_value(option: Option, value: object) -> OptionValue | None:
 
 def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = repr) -> str:
     """What an option allows, in words; `show` writes a value."""
+    if option.words:
+        return option.words
     if option.choices:
         *first, last = map(show, option.choices)
         return f"{', '.join(first)} or {last}" if first else last

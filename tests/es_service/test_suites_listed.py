@@ -18,6 +18,13 @@ def test_a_suite_that_does_not_exist_gets_the_nearest():
     assert str(done.exception).endswith("jumanji, kheperax or playground; did you mean gymnax?")
 
 
+@pytest.mark.parametrize("library", ["brax", "gymnasium", "mujoco"])
+def test_a_library_that_is_no_suite_is_answered_with_its_guide(library):
+    done = CliRunner().invoke(app, ["list", "--suite", library])
+    assert f"{library} is no suite" in str(done.exception)
+    assert str(done.exception).endswith("es-service help other_suites has them")
+
+
 @pytest.mark.slow
 def test_a_suite_is_listed_with_its_sizes_or_with_its_extra():
     done = CliRunner().invoke(app, ["list", "--suite", "kheperax", "--json"])
@@ -29,4 +36,6 @@ def test_a_suite_is_listed_with_its_sizes_or_with_its_extra():
     assert {row["name"] for row in rows} == {f"kheperax:{maze}" for maze in ("standard", "pointmaze", "snake")}
     assert {(row["observation_size"], row["action_size"], row["episode_steps"]) for row in rows} == {(5, 2, 1000)}
     shown = CliRunner().invoke(app, ["list", "--suite", "kheperax"]).stdout
+    assert shown.startswith("3 environments: kheperax:standard, ")
+    assert "option descriptor: null (a list of places in an observation" in shown
     assert "observation 5, action 2, steps 1000" in shown

@@ -43,6 +43,8 @@ from workers.environments.declared import Described, dimensions, import_named
 from workers.environments.host_task import action_bounds
 from workers.environments.user_task import words_in_place_of_keys
 
+DESCRIPTOR = Option(None, words="a list of places in an observation and names of measures, or module:function")
+
 
 @dataclass(frozen=True)
 class Package:
@@ -204,8 +206,8 @@ def require_known(suite: str, name: str, names: Iterable[str]) -> None:
     known = sorted(names)
     if name not in known:
         near = get_close_matches(name, known, n=1, cutoff=0.3)
-        hint = f"; did you mean {suite}:{near[0]}?" if near else ""
-        raise TaskError(f"{suite}:{name} is not in the installed suite, which has {', '.join(known)}{hint}")
+        hint = f"did you mean {suite}:{near[0]}? " if near else ""
+        raise TaskError(f"{suite}:{name} is not in the installed suite; {hint}it has {', '.join(known)}")
 
 
 def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
@@ -221,7 +223,7 @@ def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
         episode_steps=suite.episode_steps,
         descriptor_names=names,
         descriptor_bounds=bounds,
-        options={"descriptor": Option(None), **suite.options},
+        options={"descriptor": DESCRIPTOR, **suite.options},
         action_bounds=suite.actions.bounds,
         discrete_actions=takes_one,
         ranked_actions=has_choices and not takes_one,
