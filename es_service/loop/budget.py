@@ -74,7 +74,7 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequenc
         elif seconds + least > limit:
             reasons["wall_clock_s"] = (
                 f"{budget} has no time for another generation: {seconds:.1f} s are spent, and each of the last "
-                f"{len(recent)} generations took at least {least:.1f} s"
+                f"{len(recent)} generations took at least {least:.3g} s"
             )
     return reasons
 

@@ -101,8 +101,8 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
     evaluated = f"{evaluated_word(recent[-1])} fitness"
     columns: dict[str, Callable[[Row], str]] = {
         "generation": lambda row: str(row["generation"]),
-        evaluated: lambda row: f"{row['centre_fitness_mean']:.2f}" + _spread(row["centre_fitness_std"]),
-        "best so far": lambda row: f"{row['best_fitness']:.2f}",
+        evaluated: lambda row: f"{row['centre_fitness_mean']:z.2f}" + _spread(row["centre_fitness_std"]),
+        "best so far": lambda row: f"{row['best_fitness']:z.2f}",
         "env steps": lambda row: short(row["env_steps"]),
         "steps/s": lambda row: short(row["steps_per_second"]),
         "population median": lambda row: _number(row["population_fitness_median"]),
@@ -132,8 +132,8 @@ def time_by_part(rows: deque[Row] | list[Row]) -> str:
 
 def plain_line(row: Row) -> str:
     return (
-        f"generation {row['generation']}  {evaluated_word(row)} {row['centre_fitness_mean']:.2f}  "
-        f"best {row['best_fitness']:.2f}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
+        f"generation {row['generation']}  {evaluated_word(row)} {row['centre_fitness_mean']:z.2f}  "
+        f"best {row['best_fitness']:z.2f}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
     )
 
 
@@ -153,7 +153,7 @@ def _plain_lines(console: Console) -> ShowRow:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    return "-" if value is None else f"{value:z.2f}"
 
 
 def short(value: float) -> str:

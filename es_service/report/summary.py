@@ -17,7 +17,7 @@ from es_service.config.text import in_line
 from es_service.errors import counted
 from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.sources import in_words
+from es_service.protocol.sources import HASH_DIGITS, in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
@@ -159,11 +159,10 @@ def provenance(data: RunData) -> list[tuple[str, str]]:
         since = f" since generation {at:,}" if len(data.platforms) > 1 else ""
         fields += [
             (f"machine{since}", str(platform.get("cpu", "?"))),
-            (f"versions{since}", ", ".join(f"{name} {text}" for name, text in platform.items() if _is_version(name))),
+            (f"versions{since}", _versions(platform)),
         ]
         for other in platform.get("workers", ()):
-            versions = ", ".join(f"{name} {text}" for name, text in other.items() if _is_version(name))
-            fields.append((f"workers{since}", f"{other.get('cpu', '?')}; {versions}"))
+            fields.append((f"workers{since}", f"{other.get('cpu', '?')}; {_versions(other)}"))
         if CODE in platform:
             changed = code_changes(before, platform)
             fields.append(
@@ -232,8 +231,12 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def _is_version(name: str) -> bool:
-    return name not in ("cpu", "workers", CODE)
+def _versions(platform: Mapping[str, Any]) -> str:
+    """Versions of Python, of its packages, and of the library that defines the task or the search."""
+    code = platform.get(CODE, {}).items()
+    libraries = {name: text for name, text in code if len(text) < HASH_DIGITS}  # recorded in the place of hashes
+    packages = {name: text for name, text in platform.items() if name not in ("cpu", "workers", CODE)}
+    return ", ".join(f"{name} {text}" for name, text in (packages | libraries).items())
 
 
 # The settings of a run that differ from the defaults of its task, its algorithm and its preset.

@@ -296,7 +296,7 @@ def failed_sentence(means: Sequence[float]) -> str:
     """What `failed_tries` returns in words, such as "2 tries, none held: -127.03, -127.06"; empty if it is empty."""
     if not means:
         return ""
-    shown = ", ".join(f"{mean:.2f}" for mean in means[-SHOWN_TRIES:])
+    shown = ", ".join(f"{mean:z.2f}" for mean in means[-SHOWN_TRIES:])
     newest = f" (the newest {SHOWN_TRIES})" if len(means) > SHOWN_TRIES else ""
     return f"1 try, did not hold: {shown}" if len(means) == 1 else f"{len(means):,} tries, none held: {shown}{newest}"
 

@@ -39,7 +39,7 @@ def row(generation=7, seconds=90.0):
     [
         (90.0, (9.0, 30.0, 9.5), None),  # may end at 99
         (90.0, (11.0, 30.0), "has no time for another generation: 90.0 s are spent, and each of the last 2 generations "
-                             "took at least 11.0 s"),
+                             "took at least 11 s"),
         (90.0, (11.0,), None),  # in which workers may have compiled
         (90.0, (), None),
         (104.25, (1.0, 1.0), "is spent, exceeded by 4.2 s"),

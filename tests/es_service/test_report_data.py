@@ -314,10 +314,11 @@ def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
 def test_code_is_told_in_a_line_and_a_change_of_it_by_its_files(tmp_path):
     """Not by the hash of each of a hundred files."""
     data = read_run(write_run(tmp_path / "run"))
-    before, after = {"loop/a.py": "1" * 64, "loop/b.py": "2" * 64}, {"loop/a.py": "1" * 64, "loop/b.py": "3" * 64}
+    libraries = {"gymnax": "1.0.1"}
+    before, after = ({"loop/a.py": "1" * 32, "loop/b.py": digit * 32} | libraries for digit in "23")
     platforms = [(0, {"cpu": "x", "jax": "1.0", CODE: before}), (9, {"cpu": "x", "jax": "1.0", CODE: after})]
     fields = dict(summary.provenance(replace(data, platforms=platforms)))
-    assert fields["versions since generation 0"] == "jax 1.0"
+    assert fields["versions since generation 0"] == "jax 1.0, gymnax 1.0.1"
     first, second = (fields[f"code since generation {at}"] for at in (0, 9))
     assert first == code_text(before)
     assert second == f"{code_text(after)}; loop/b.py changed"

@@ -212,7 +212,9 @@ def test_a_suite_that_is_not_installed_names_its_extra_and_its_size(suite: str, 
 def test_what_is_missing_is_said_with_what_to_do() -> None:
     with pytest.raises(TaskError, match=r"toys_nobody_has is not installed; install a few MB: get toys"):
         suite_module("toys", Package("toys_nobody_has", "a few MB:", "get toys"))
-    with pytest.raises(TaskError, match=r"toys:Lin is not in the installed suite; did you mean toys:Line\? it has "):
+    with pytest.raises(
+        TaskError, match=r"toys:Lin is not in the installed suite; did you mean toys:Line\?; these are: "
+    ):
         require_known("toys", "Lin", ["Line", "Grid"])
 
 

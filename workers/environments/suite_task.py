@@ -206,8 +206,8 @@ def require_known(suite: str, name: str, names: Iterable[str]) -> None:
     known = sorted(names)
     if name not in known:
         near = get_close_matches(name, known, n=1, cutoff=0.3)
-        hint = f"did you mean {suite}:{near[0]}? " if near else ""
-        raise TaskError(f"{suite}:{name} is not in the installed suite; {hint}it has {', '.join(known)}")
+        hint = f"; did you mean {suite}:{near[0]}?" if near else ""
+        raise TaskError(f"{suite}:{name} is not in the installed suite{hint}; these are: {', '.join(known)}")
 
 
 def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
