@@ -28,8 +28,8 @@ from xml.etree import ElementTree
 from es_service.protocol.machine import architecture
 
 Sources = Mapping[str, str]
-"""Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits; or name of
-a library that defines a task or a search -> its version."""
+"""Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits; or name
+of a library that defines a task or a search -> its version."""
 HASH_DIGITS = 32
 OURS = ("es_service", "workers")
 WORKERS = ("workers", "es_service.protocol")
