@@ -185,7 +185,9 @@ def _finite(value: Any) -> Any:
 ConfigArgument = Annotated[
     Path, typer.Argument(parser=given_path, help="YAML file, or the name of a shipped config.", show_default=False)
 ]
-RunArgument = Annotated[Path, typer.Argument(parser=given_path, help="Folder of a run.", show_default=False)]
+RunArgument = Annotated[
+    Path, typer.Argument(parser=given_path, metavar="RUN", help="Folder of a run.", show_default=False)
+]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
 ]

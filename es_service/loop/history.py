@@ -258,14 +258,14 @@ def quartiles(values_N: NDArray[np.float64]) -> list[float]:
     """
     if not values_N.size:
         return [math.nan] * 5
-    sorted_N = np.sort(values_N).tolist()
+    last = values_N.size - 1
+    below = [numerator * last // 4 for numerator in range(5)]
+    low, high = np.sort(values_N)[[below, [min(at + 1, last) for at in below]]].tolist()
     values = []
-    for numerator in range(5):
-        at = numerator / 4 * (len(sorted_N) - 1)
-        below = min(int(at), len(sorted_N) - 1)
-        low, high, share = sorted_N[below], sorted_N[min(below + 1, len(sorted_N) - 1)], at - below
+    for numerator, at, first, second in zip(range(5), below, low, high, strict=True):
+        share = numerator / 4 * last - at
         # Interpolated from the nearer of the two, as NumPy does.
-        values.append(low + (high - low) * share if share < 0.5 else high - (high - low) * (1.0 - share))
+        values.append(first + (second - first) * share if share < 0.5 else second - (second - first) * (1.0 - share))
     return values
 
 

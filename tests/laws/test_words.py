@@ -10,6 +10,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from es_service.cli import main
 from es_service.cli.main import app
 from es_service.config.keys import FIELDS, GROUPS, RENAMED, all_search_fields
 from es_service.loop.history import history_columns
@@ -55,6 +56,13 @@ def test_keys_and_columns() -> None:
         assert "member" not in name or name in MEMBERS
     assert not RENAMED.keys() & known.keys()
     assert set(RENAMED.values()) <= known.keys()
+
+
+def test_the_command_line_s_docstring_names_all_commands():
+    """Its owner looks there first."""
+    names = re.search(r"es-service (.*?)`", str(main.__doc__), re.DOTALL)
+    assert names
+    assert {*names[1].replace("|", " ").split()} == {*get_command(app).commands}  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in get_command(app).commands)])  # type: ignore[attr-defined]
