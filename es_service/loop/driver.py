@@ -17,8 +17,6 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
 from es_service.errors import StoreError
@@ -54,7 +52,6 @@ from es_service.protocol.content import Arrays
 from es_service.protocol.episodes import DispatchCounts, Evaluator, OverlappedRequests, Requests, Value
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
-from es_service.search.novelty import novelty
 
 
 def run(
@@ -241,12 +238,12 @@ def generation(
     if number == 0:
         start_cells, members, stepped = {}, Members(), state.search
         told, named = yield from _initial(search, state, clock)
-        novelty_N = np.full(len(told), np.nan)
+        archive = None
     else:
         begun, start_cells, asked = propose(search, policies, state)
         clock.lap("seconds_driver")
         members, stepped, (told, named) = yield from _asked(search, state, begun, asked, clock)
-        novelty_N = novelty(stepped.archive, told.descriptor_N_B, **dict(search.config.novelty))
+        archive = stepped.archive
     learned = tell(search.algorithm, stepped, told)
     policies.add(named.contents, named.origins)
     clock.lap("seconds_driver")
@@ -258,7 +255,7 @@ def generation(
         "lost_workers": now.lost_workers - since.lost_workers,
         "workers": now.workers,
     }
-    computed = start_cells, members, told, named, novelty_N
+    computed = start_cells, members, told, named, archive
     finished = finish(state, learned, *computed, correction, faults, search, clock)
     return replace(finished, state=replace(finished.state, rollout_s=now.rollout_s, cpu_s=now.cpu_s))
 

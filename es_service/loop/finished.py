@@ -30,6 +30,7 @@ from es_service.protocol.messages import EpisodesResult, Moments
 from es_service.search.algorithms.base import CentreEvaluations, SearchState
 from es_service.search.maps.behaviour_map import EMPTY, map_statistics
 from es_service.search.maps.geometry import reachable_cells, tessellation
+from es_service.search.novelty import NoveltyArchive, novelty
 from es_service.search.steps import norm
 
 Reachable = NDArray[np.bool_] | None
@@ -64,8 +65,9 @@ class Finished:
     """What the search was told of the new centres and the policies. N: each of them."""
     named: Named
     """Which policies these are."""
-    novelty_N: NDArray[np.float64]
-    """Novelty of each in the archive before the generation; NaN for initial centres."""
+    archive: NoveltyArchive | None
+    """The novelty archive before the search was told of them, by which their novelty is stored; None for initial
+    centres."""
     cell_N: NDArray[np.int64] | None
     """Cells of which they are the elites, EMPTY for the others; None without a map."""
     columns: HistoryRow
@@ -109,7 +111,7 @@ def finish(
     members: Members,
     told: CentreEvaluations,
     named: Named,
-    novelty_N: NDArray[np.float64],
+    archive: NoveltyArchive | None,
     correction: Correction,
     faults: HistoryRow,
     search: Search,
@@ -139,14 +141,16 @@ def finish(
     recent = (*before.durations, *durations([{"generation": generation, **laps}]))[-MOST_DURATIONS:]
     state = replace(state, durations=recent)
     columns = {**correction.columns, **faults, **laps}
-    computed = start_cells, members, told, named, novelty_N, cell_N
+    computed = start_cells, members, told, named, archive, cell_N
     return Finished(before, state, *computed, columns, seconds)
 
 
 def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:
     """A generation's row of the history, and the table of what it has evaluated."""
     state, before, told, cell_N = finished.state, finished.before, finished.told, finished.cell_N
-    table = evaluated_table(told, search.task, cell_N, finished.start_cells, finished.novelty_N)
+    archive, measured = finished.archive, dict(search.config.novelty)
+    novelty_N = np.full(len(told), np.nan) if archive is None else novelty(archive, told.descriptor_N_B, **measured)
+    table = evaluated_table(told, search.task, cell_N, finished.start_cells, novelty_N)
     at = fittest(told)  # subject of the history's row
     shown, infeasible = int(told.centre_N[at]), finished.members.infeasible
     of_map: HistoryRow = {}
@@ -163,7 +167,7 @@ def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[Hist
         "best_fitness": state.best.fitness,
         "centre": shown,
         "fitness_weight": float(told.columns["fitness_weight"][at]),
-        "centre_novelty": or_none(finished.novelty_N[at]),
+        "centre_novelty": or_none(novelty_N[at]),
         "archive_size": state.search.archive.size,
         **of_map,
         "update_norm": or_none(told.columns["update_norm"][at]),

@@ -148,8 +148,8 @@ def each(change: Callable[..., np.ndarray], *results: EpisodesResult, traces: bo
 
 
 def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
-    """Results of a work item as they travel: those of neighbouring training chunks of one request are one, since a
-    message with few arrays is read sooner. The moments stay those of each chunk, whose order decides about bits."""
+    """Results of a work item as they travel: those of neighbouring chunks of one request are one, since a message with
+    few arrays is read sooner. The moments stay those of each chunk, whose order decides about bits."""
     blocks: list[ChunkResult] = []
     for request, of_request in groupby(results, _request_of_block):
         parts = list(of_request)
@@ -158,22 +158,28 @@ def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
 
 
 def _request_of_block(result: ChunkResult) -> int | None:
-    """Request of a training chunk without outputs of steps; None for other results, which stay as they are."""
-    if isinstance(result, EpisodesResult) and isinstance(result.moments, Moments) and not result.of_steps:
-        return result.request
-    return None
+    """Request of a chunk of episodes without outputs of steps; None for other results, which stay as they are."""
+    return result.request if isinstance(result, EpisodesResult) and not result.of_steps else None
 
 
 def _block(parts: Sequence[Any]) -> EpisodesResult:
-    moments = [part.moments for part in parts]
-    of_chunks = MomentsOfChunks(
-        np.array([each_moments.count for each_moments in moments]),
-        np.stack([each_moments.mean_O for each_moments in moments]),
-        np.stack([each_moments.m2_O for each_moments in moments]),
+    rows = each(lambda *arrays: np.concatenate(arrays), *parts, traces=False)
+    row_N, moments = np.concatenate([part.row_N for part in parts]), [part.moments for part in parts]
+    return replace(
+        rows,
+        moments=None if moments[0] is None else MomentsOfChunks.of(moments),
+        trace_T_B=_trace_of_block(parts),
+        request=parts[0].request,
+        row_N=row_N,
     )
-    row_N = np.concatenate([part.row_N for part in parts])
-    rows = each(lambda *arrays: np.concatenate(arrays), *parts)
-    return replace(rows, moments=of_chunks, request=parts[0].request, row_N=row_N)
+
+
+def _trace_of_block(parts: Sequence[Any]) -> NDArray | None:
+    """Traces of all policies; of a centre that of its first chunk here, since only its first episode's is asked for."""
+    traced = [part for part in parts if part.trace_T_B is not None]
+    if traced and traced[0].trace_T_B.ndim == 2:
+        return min(traced, key=lambda part: part.row_N.min()).trace_T_B
+    return np.concatenate([part.trace_T_B for part in traced]) if traced else None
 
 
 def moments_in(results: Sequence[EpisodesResult]) -> list[Moments]:

@@ -10,7 +10,7 @@ observation statistics: not on the worker, on the order, or on how often the chu
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -356,6 +356,16 @@ class MomentsOfChunks:
     mean_C_O: NDArray[np.float64]
     m2_C_O: NDArray[np.float64]
 
+    @classmethod
+    def of(cls, moments: Sequence[Moments]) -> MomentsOfChunks:
+        """Those of chunks, in their order."""
+        count_C = np.array([of_chunk.count for of_chunk in moments])
+        return cls(
+            count_C,
+            np.stack([of_chunk.mean_O for of_chunk in moments]),
+            np.stack([of_chunk.m2_O for of_chunk in moments]),
+        )
+
     def each(self) -> list[Moments]:
         """Those of each chunk, in the order of the chunks."""
         return [Moments(*of_chunk) for of_chunk in zip(self.count_C.tolist(), self.mean_C_O, self.m2_C_O, strict=True)]
@@ -364,7 +374,7 @@ class MomentsOfChunks:
 @dataclass(frozen=True)
 class EpisodesResult:
     """Result of a training chunk, an evaluation chunk or a policy chunk: rows of a request. `episodes.in_blocks` makes
-    one of neighbouring training chunks, and `episodes.gathered` of all rows of a request.
+    one of neighbouring chunks, and `episodes.gathered` of all rows of a request.
 
     A training chunk's arrays have leading axes [P, S] and are over the member's episodes. The arrays of other chunks
     are of single episodes: [E] of the centre, or [L] of the policies in a chunk's slots.

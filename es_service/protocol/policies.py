@@ -111,7 +111,7 @@ class Recipes:
 
     def some(self, of: slice) -> Recipes:
         """The recipes of some of the policies, still with the parents of all."""
-        return replace(self, parent_N_2=self.parent_N_2[of], key_N_4=self.key_N_4[of])
+        return Recipes(self.rule, self.names, self.parents, self.parent_N_2[of], self.key_N_4[of], self.origins)
 
     def complete(self, known: Mapping[bytes, FloatArray], origins: Mapping[bytes, Origin]) -> Recipes:
         """The recipes with the parents' parameters, which are taken from others by their names, and with origins."""

@@ -11,7 +11,7 @@ import pytest
 from es_service import api
 from es_service.errors import EvaluationError
 from es_service.loop.contents import no_statistics, policy_work
-from es_service.protocol.episodes import gathered
+from es_service.protocol.episodes import gathered, in_blocks
 from es_service.protocol.messages import PolicyChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, PolicyAsk
@@ -125,6 +125,40 @@ def test_an_elite_that_was_a_policy_has_its_parameters_statistics_and_trace(fini
         np.testing.assert_array_equal(elite.trace_T_B, results[generation][ask].trace_T_B[number])
         seen.add(ask)
     assert seen == {0, 1}
+
+
+class Joining(Sharing):
+    """Workers with several cores: the chunks of each work item, of random lengths, are joined as they travel."""
+
+    random = np.random.default_rng(0)
+
+    def evaluate(self, work):
+        results, answered = super().evaluate(work), []
+        while results:
+            size = int(self.random.integers(1, 12))
+            answered += in_blocks(results[:size])
+            results = results[size:]
+        return answered
+
+
+def test_results_that_are_joined_as_they_travel_are_those_of_the_chunks(finished):
+    _, store, evaluator = finished
+    _, joined, joining = run_in_memory(config(), Joining(), algorithm=mixed(config()))
+    assert joined.evaluated == store.evaluated
+    assert len(joined.after) == len(store.after) == 3
+    for before, after in zip(store.after, joined.after, strict=True):
+        np.testing.assert_equal(after, before)
+    assert len(joining.recorded) == len(evaluator.recorded)
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 20])
+def test_all_rows_and_traces_of_joined_results_are_in_their_places(episodes):
+    policies = np.tile(POLICIES, (3, 1)) + np.arange(54, dtype=np.float32)[:, None] / 50
+    asked = policy_work(policies, no_statistics(54, 2), episodes, seed=0, generation=1, ask=0, traces=True)
+    (alone,), (joined,) = (gathered([asked.shape], one.evaluate(asked.work)) for one in (Sharing(), Joining()))
+    np.testing.assert_equal(dataclasses.asdict(joined), dataclasses.asdict(alone))
+    assert alone.trace_T_B is not None
+    assert len(np.unique(alone.trace_T_B, axis=0)) == 54
 
 
 def test_a_policy_can_be_the_best_and_the_row_of_the_history_is_then_about_it(finished):
