@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from es_service.protocol.episodes import in_blocks
+from es_service.protocol.episodes import apart, in_blocks
 from es_service.protocol.machine import cpu_seconds, platform_info, platform_text
 from es_service.protocol.messages import Report, Work, WorkerPlace
 from es_service.protocol.process_environment import DEPTH, newest_output, worker_environment
@@ -160,7 +160,8 @@ class WorkerActor:
         small, origins, work = pickle.loads(item)
         for named in (small, *map(pickle.loads, arrays)):
             self._received.add(named)
-        return self._received.work(origins, work)
+        received = self._received.work(origins, work)
+        return apart(received) if self._joins else received
 
 
 def remove_old_logs(own: Path) -> None:

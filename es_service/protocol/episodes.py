@@ -151,15 +151,19 @@ def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
     """Results of a work item as they travel: those of neighbouring chunks of one request are one, since a message with
     few arrays is read sooner. The moments stay those of each chunk, whose order decides about bits."""
     blocks: list[ChunkResult] = []
-    for request, of_request in groupby(results, _request_of_block):
-        parts = list(of_request)
-        blocks += parts if request is None or len(parts) == 1 else [_block(parts)]
+    for form, of_form in groupby(results, _form_of_block):
+        parts = list(of_form)
+        blocks += parts if form is None or len(parts) == 1 else [_block(parts)]
     return blocks
 
 
-def _request_of_block(result: ChunkResult) -> int | None:
-    """Request of a chunk of episodes without outputs of steps; None for other results, which stay as they are."""
-    return result.request if isinstance(result, EpisodesResult) and not result.of_steps else None
+def _form_of_block(result: ChunkResult) -> tuple[object, ...] | None:
+    """Request and form of a chunk of episodes without outputs of steps; None for other results, which stay as they
+    are."""
+    if not isinstance(result, EpisodesResult) or result.of_steps:
+        return None
+    of_centre = result.trace_T_B is not None and result.trace_T_B.ndim == 2
+    return result.request, result.moments is None, of_centre, tuple(result.outputs)
 
 
 def _block(parts: Sequence[Any]) -> EpisodesResult:
@@ -329,6 +333,22 @@ def together(work: Sequence[Work], most: int) -> list[Work]:
     return merged
 
 
+def apart(work: Sequence[Work]) -> list[Work]:
+    """Policies that were put together for the cores of a worker, in chunks again, which the cores share."""
+    chunks: list[Work] = []
+    for subject, chunk in work:
+        recipes = recipes_in(subject)
+        if isinstance(chunk, PolicyChunk) and isinstance(subject, Policies) and recipes and chunk.count > POLICY_SLOTS:
+            for first in range(0, chunk.count, POLICY_SLOTS):
+                some = recipes.part(slice(first, first + POLICY_SLOTS))
+                number = chunk.chunk_id + first // POLICY_SLOTS
+                policies = replace(subject, first=subject.first + first, parameters_N_D=some)
+                chunks.append((policies, replace(chunk, chunk_id=number, count=POLICY_SLOTS)))
+        else:
+            chunks.append((subject, chunk))
+    return chunks
+
+
 def _joined(recipes: Sequence[Recipes | None]) -> Recipes:
     """Recipes of one ask, one after another."""
     parts = [part for part in recipes if part is not None]
@@ -349,11 +369,11 @@ def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
         and isinstance(subject, Policies)
         and isinstance(before, Policies)
         and isinstance(beginning, Policies)
+        and isinstance(chunk, PolicyChunk)
+        and (chunk.part, chunk.first, chunk.count) == (0, 0, POLICY_SLOTS)
         and subject.first + len(recipes) - beginning.first <= most
         and subject.episodes == 1
         and subject.observation_mean_N_O is before.observation_mean_N_O is None
-        and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
-        and chunk == replace(last, chunk_id=last.chunk_id + 1)
-        and isinstance(chunk, PolicyChunk)
-        and (chunk.part, chunk.first, chunk.count) == (0, 0, POLICY_SLOTS)
+        and vars(subject) == {**vars(before), "first": before.first + len(earlier), "parameters_N_D": recipes}
+        and vars(chunk) == {**vars(last), "chunk_id": last.chunk_id + 1}
     )

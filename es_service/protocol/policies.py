@@ -33,6 +33,8 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 POLICY_SLOTS = 16
 """Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
 compiled never changes."""
+ALL_TOGETHER = 1 << 62
+"""Number of policies that a worker with several cores is sent as one chunk, which it takes apart: any."""
 POLICIES_TOGETHER = 8 * POLICY_SLOTS
 """Most slots in one call of a kernel: a call costs little then, and the memory of the weights stays small."""
 

@@ -45,7 +45,7 @@ from es_service.protocol.messages import (
     evaluation_chunks,
 )
 from es_service.protocol.nearest import NOVELTY
-from es_service.protocol.policies import Policies, Recipes
+from es_service.protocol.policies import ALL_TOGETHER, Policies, Recipes
 from es_service.protocol.sent import Received
 from es_service.runs.checked_config import columns
 from es_service.search.algorithms import ALGORITHMS
@@ -248,7 +248,7 @@ def message_costs(
                 engine.evaluate([work])
                 alone_s.append(time.perf_counter() - began)
             way_s[_kind(work)] = max(0.0, (statistics.median(alone_s) - SPIN_S - driver_s) / 2)
-    with ray_engine(echo, Limits(1, item_s=NEVER_S), actor=EchoActor) as engine:
+    with ray_engine(echo, Limits(1, item_s=NEVER_S, policies_together=ALL_TOGETHER), actor=EchoActor) as engine:
         for work in works:
             item = list(islice(cycle(work), ECHO_CHUNKS))
             for _ in range(2):  # from now on it is known how long a chunk takes, and all of them are one item

@@ -10,10 +10,10 @@ import pytest
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.loop.contents import no_statistics, policy_work
-from es_service.protocol.episodes import gathered, pieces_of, together
+from es_service.protocol.episodes import apart, gathered, pieces_of, together
 from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, evaluation_chunks, with_subject
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.policies import POLICY_SLOTS, IsoLine, recipes_of
+from es_service.protocol.policies import ALL_TOGETHER, POLICY_SLOTS, IsoLine, recipes_of
 from tests.helpers import centre, random_parameters, spec
 from workers.worker import make_worker
 
@@ -131,6 +131,16 @@ def test_what_is_sent_has_the_parents_that_it_needs_and_no_others():
         assert chunk.count == POLICY_SLOTS
         expected = recipes(40).made()[subject.first : subject.first + len(used)]
         np.testing.assert_array_equal(used.made(), expected)
+
+
+@pytest.mark.parametrize("policies", [16, 17, 70])
+def test_policies_for_several_cores_are_sent_as_one_chunk_that_comes_apart_into_what_it_was(policies):
+    work = [*asked_for(policies).work, *asked_for(35, episodes=2).work, *asked_for(20, ask=1).work]
+    sent = together(work, ALL_TOGETHER)
+    assert len(sent) == 1 + len(asked_for(35, episodes=2).work) + 1
+    for (subject, chunk), (whole, same) in zip(apart(sent), work, strict=True):
+        assert (chunk, subject.first, subject.episodes) == (same, whole.first, whole.episodes)
+        np.testing.assert_array_equal(subject.parameters_N_D.made(), whole.parameters_N_D.made())
 
 
 def test_only_neighbours_of_one_ask_are_one_chunk():
