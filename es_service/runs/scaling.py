@@ -71,9 +71,9 @@ REPLAYED, SCATTER = 2048, 0.05
 """Different answers of each kind, and the standard deviation of an answer's descriptors as a share of their range."""
 UNBOUNDED = 1e3
 """In the place of a bound of the descriptor that is larger."""
-ECHO_ITEMS, ECHO_CHUNKS, SPIN_S = 100, 32, 0.003
-"""Work items in each measurement of messages, chunks of an item that has several, and the time that the actor computes
-for it: while it does so, the driver falls asleep, and being woken is a part of what a message costs."""
+ECHO_ITEMS, ECHO_CHUNKS, SPIN_S = 100, 128, 0.003
+"""Work items in each measurement of messages, chunks of an item for a node, and the time that the actor computes for
+it: while it does so, the driver falls asleep, and being woken is a part of what a message costs."""
 
 
 def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int) -> Iterator[dict[str, Any]]:
@@ -107,6 +107,7 @@ def _initial_centres(config: RunConfig, spec: WorkerSpec) -> list[Centre]:
     """A centre for each population of a generation, with a novelty archive where workers need one."""
     search, zeros_O = config.search, np.zeros(spec.policy.widths[0], np.float32)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
+    parameters.setflags(write=False)  # as in a state: its name is computed once
     sigma = search.sigma if isinstance(search, PopulationConfig) else 0.0
     centres = [Centre(1, parameters, sigma, zeros_O, zeros_O + 1.0) for _ in range(max(1, search.populations()))]
     if not isinstance(search, PopulationConfig):
@@ -151,7 +152,7 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: Run
     if phase.name == "rollout":
         return [(centre, TrainingChunk(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
     return [
-        (replace(centre, archive=None), chunk)
+        (replace(centre, parameters_D=centre.parameters_D.copy(), archive=None), chunk)
         for ask, centre in enumerate(centres)
         for chunk in evaluation_chunks(1, config.search.evaluation_episodes, ask=ask)
     ]
