@@ -160,7 +160,7 @@ def in_blocks(results: Sequence[ChunkResult]) -> list[ChunkResult]:
 def _form_of_block(result: ChunkResult) -> tuple[object, ...] | None:
     """Request and form of a chunk of episodes without outputs of steps; None for other results, which stay as they
     are."""
-    if not isinstance(result, EpisodesResult) or result.of_steps:
+    if not isinstance(result, EpisodesResult) or result.of_steps or result.row_N is None:
         return None
     of_centre = result.trace_T_B is not None and result.trace_T_B.ndim == 2
     return result.request, result.moments is None, of_centre, tuple(result.outputs)

@@ -33,6 +33,7 @@ import numpy as np
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_engine import ray_engine
 from es_service.dispatch.simulation import Costs, Phase, predict
+from es_service.protocol.episodes import addressed
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
     NO_CENTRE,
@@ -41,6 +42,7 @@ from es_service.protocol.messages import (
     EpisodesResult,
     GradientChunk,
     GradientResult,
+    Moments,
     TrainingChunk,
     Work,
     with_subject,
@@ -88,7 +90,7 @@ def sleep(work: Sequence[Work]) -> list[ChunkResult]:
     """Results of chunks, after the time that a core takes for them."""
     slowness, training_s = float(os.environ.get(SLOWNESS, "1")), float(os.environ[TRAINING_S])
     time.sleep(slowness * sum(GRADIENT_S if isinstance(chunk, GradientChunk) else training_s for _, chunk in work))
-    return [_GRADIENT if isinstance(chunk, GradientChunk) else _EPISODES for _, chunk in work]
+    return [_GRADIENT if isinstance(one[1], GradientChunk) else addressed(one, _EPISODES) for one in work]
 
 
 _GRADIENT = GradientResult(np.ones(PARAMETERS, np.float32))
@@ -98,7 +100,7 @@ _EPISODES = EpisodesResult(
     descriptor=np.zeros((PAIRS, 2, 2), np.float32),
     steps=np.full((PAIRS, 2), 3000, np.int32),
     goal_distance=np.zeros((PAIRS, 2, 2), np.float32),
-    moments=None,
+    moments=Moments(1.0, np.zeros(29), np.zeros(29)),
 )
 
 
@@ -122,7 +124,9 @@ class Case(NamedTuple):
 
 def phases(case: Case, generation: int) -> tuple[list[Work], list[Work]]:
     """The work of a generation: its training chunks, and its gradient chunks."""
-    centre = Centre(1, np.zeros(PARAMETERS, np.float32), 0.02, np.zeros(29, np.float32), np.ones(29, np.float32))
+    parameters_D = np.zeros(PARAMETERS, np.float32)
+    parameters_D.setflags(write=False)  # as in a run
+    centre = Centre(1, parameters_D, 0.02, np.zeros(29, np.float32), np.ones(29, np.float32))
     weights_P = np.ones(PAIRS, np.float32)
     training = [TrainingChunk(generation, i) for i in range(case.workers * case.training_chunks)]
     gradient = [GradientChunk(generation, i, weights_P) for i in range(case.workers)]
