@@ -238,10 +238,16 @@ def _about(task: TaskSpec) -> str:
     return "\n".join(lines)
 
 
+DESCRIPTOR_OF_SUITE = "a list of places in an observation and names of measures, or module:function"
+"""What the only option without a default may be, of the tasks that are listed."""
+
+
 def _option(option: Option) -> str:
     """What a config may set, the default first."""
     if option.choices:
         return " | ".join(map(show, option.choices))
+    if option.default is None:
+        return f"null ({DESCRIPTOR_OF_SUITE})"
     return f"{show(option.default)} ({allowed_text(option, show)})"
 
 

@@ -37,8 +37,6 @@ class Option:
     """Least and greatest value of a number, both allowed; None for no bound."""
     choices: tuple[OptionValue, ...] = ()
     """The only allowed values; empty if there are others."""
-    words: str = ""
-    """What is allowed, in words, where type and bounds do not say it."""
 
 
 def choice(*values: OptionValue) -> Option:
@@ -118,8 +116,6 @@ def allowed_value(option: Option, value: object) -> OptionValue | None:
 
 def allowed_text(option: Option, show: Callable[[OptionValue | float], str] = repr) -> str:
     """What an option allows, in words; `show` writes a value."""
-    if option.words:
-        return option.words
     if option.choices:
         *first, last = map(show, option.choices)
         return f"{', '.join(first)} or {last}" if first else last

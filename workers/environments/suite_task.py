@@ -43,9 +43,6 @@ from workers.environments.declared import Described, dimensions, import_named
 from workers.environments.host_task import action_bounds
 from workers.environments.user_task import words_in_place_of_keys
 
-DESCRIPTOR = Option(None, words="a list of places in an observation and names of measures, or module:function")
-
-
 @dataclass(frozen=True)
 class Package:
     """The package of a suite."""
@@ -223,7 +220,7 @@ def describe_suite(suite: Suite, given: Mapping[str, OptionValue]) -> TaskSpec:
         episode_steps=suite.episode_steps,
         descriptor_names=names,
         descriptor_bounds=bounds,
-        options={"descriptor": DESCRIPTOR, **suite.options},
+        options={"descriptor": Option(None), **suite.options},
         action_bounds=suite.actions.bounds,
         discrete_actions=takes_one,
         ranked_actions=has_choices and not takes_one,
