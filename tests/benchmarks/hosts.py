@@ -1,7 +1,7 @@
 """What does a cluster of four hosts with 16 cores each make of its cores, and what does a host that is slow cost?
 
     python -m tests.benchmarks.hosts
-    python -m tests.benchmarks.hosts --scale     # 16 hosts with 64 cores each, beside the prediction of `bench scaling`
+    python -m tests.benchmarks.hosts --scale     # 4, 8, 16 hosts with 64 cores, beside the prediction of `bench scaling`
 
 Real are the driver's engine, Ray, its messages between hosts (network namespaces of this machine) and the node actor
 that divides a work item among its cores. Only a chunk is not: a core sleeps for as long as it would take, so that two
@@ -67,8 +67,8 @@ GRADIENT_S = 0.01
 """Seconds of a core for a gradient chunk."""
 MANY, FEW = 16, 1
 """Training chunks of a generation for each core."""
-SCALE = 16, 64
-"""Hosts, and cores of each, of `--scale`."""
+SCALE = (4, 8, 16), 64
+"""Numbers of hosts, and cores of each, of `--scale`."""
 GENERATIONS = 12
 """The first third does not count: in the first one, durations are not known."""
 PAIRS, PARAMETERS = 64, 75_528
@@ -189,7 +189,7 @@ def measure(hosts: int, slow: bool, cases: Sequence[Case], **more: Any) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scale", action="store_true", help="16 hosts with 64 cores each, beside the prediction")
+    parser.add_argument("--scale", action="store_true", help="hosts with 64 cores each, beside the prediction")
     parser.add_argument("--drive", nargs=6, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.drive:
@@ -199,8 +199,9 @@ def main() -> None:
     if (lacking := missing()) is not None:
         raise SystemExit(lacking)
     if given.scale:
-        case = Case(*SCALE, 4, 2.0, 1.0)
-        measure(SCALE[0], False, [case], predicted_seconds=round(predicted(case), 3))
+        counts, cores = SCALE
+        for case in (Case(hosts, cores, 4, 2.0, 1.0) for hosts in counts):
+            measure(case.actors, False, [case], predicted_seconds=round(predicted(case), 3))
         return
     measure(HOSTS, False, [Case(1, 1, MANY, 2.0), Case(HOSTS, CORES, MANY, 2.0)])
     measure(HOSTS, True, [Case(HOSTS, CORES, chunks, factor) for chunks in (MANY, FEW) for factor in (2.0, math.inf)])

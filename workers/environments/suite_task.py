@@ -43,6 +43,7 @@ from workers.environments.declared import Described, dimensions, import_named
 from workers.environments.host_task import action_bounds
 from workers.environments.user_task import words_in_place_of_keys
 
+
 @dataclass(frozen=True)
 class Package:
     """The package of a suite."""
