@@ -1,7 +1,7 @@
 """What does a cluster of four hosts with 16 cores each make of its cores, and what does a host that is slow cost?
 
     python -m tests.benchmarks.hosts
-    python -m tests.benchmarks.hosts --scale     # 4, 8, 16 hosts with 64 cores, beside the prediction of `bench scaling`
+    python -m tests.benchmarks.hosts --scale     # 4, 8, 16 hosts of 64 cores, beside the prediction of `bench scaling`
 
 Real are the driver's engine, Ray, its messages between hosts (network namespaces of this machine) and the node actor
 that divides a work item among its cores. Only a chunk is not: a core sleeps for as long as it would take, so that two
