@@ -106,7 +106,7 @@ class TaskSpec:
     notes: tuple[str, ...] = ()
     """What its author probably did not intend, such as an attribute with an unknown name, in sentences."""
     metric_names: tuple[str, ...] = ()
-    """Numbers that it records of each episode besides what every task has; see `outputs.METRICS`."""
+    """Numbers that it records of each episode besides what every task has; see `episodes.METRICS`."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class HostChoices:
     new_objects: bool = False
     """Whether each episode has an object of its own."""
     metrics: tuple[str, ...] = ()
-    """Keys of `info` that are metrics, each as KEY or KEY:TAKEN; see `outputs.CHOSEN_METRIC`."""
+    """Keys of `info` that are metrics, each as KEY or KEY:TAKEN; see `episodes.CHOSEN_METRIC`."""
 
 
 NO_CHOICES = HostChoices()

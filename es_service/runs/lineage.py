@@ -46,6 +46,8 @@ OBSERVED = ("policy.observation_clip", NORMALISED)
 """Keys that determine how a policy processes its observations."""
 SCORE_KEYS = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
 """Keys that change the highest fitness of a population, but not the meaning of an evaluation."""
+RECORDED = ("task.metrics",)
+"""Keys that change what is recorded of an episode, and no fitness."""
 ROWS_AT_ONCE = 4096
 """History rows that are held in memory together."""
 
@@ -108,7 +110,7 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     snapshot = origin.at(generation, named=named_by_all)
     at, state = snapshot.generation, state_of(snapshot.nodes, snapshot.generation, 0.0)
     changed = {name for name, _, _ in changes_from(origin.constants, config)}
-    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS)):
+    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS, RECORDED)):
         state = _without_fitness(state)
     elif changed.intersection(SCORE_KEYS):
         # The highest fitness of a population is not comparable with that of a population of another size, or with
