@@ -217,8 +217,7 @@ def test_a_fork_may_have_a_column_with_the_name_of_a_recorded_metric(tmp_path):
     fork = api.fork(run.folder, ["task.metrics=[number:sum]", "budget.generations=2"], out=tmp_path / "fork").run
     assert fork.history.metric_number.fillna(-1.0).tolist() == [-1.0, -1.0, 11.0]
     assert fork.history.metric_loss.fillna(-1.0).tolist() == [-1.0, 2.0, -1.0]
-    assert {*fork.map.cell} >= {*run.map.cell}, "what is recorded changes no fitness"
-    assert fork.history.best_fitness.is_monotonic_increasing
+    assert fork.map.generation.min() <= 1, "what is recorded changes no fitness, so elites stay"
 
 
 def test_what_a_program_records_is_a_curve_and_a_measure_of_groups(tmp_path):
