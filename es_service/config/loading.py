@@ -122,7 +122,7 @@ def read(
         source: a YAML file, the name of a shipped config, or a nested mapping with the content of one.
         overrides: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
             mapping from key to value. If they choose another task or algorithm, keys of the source that go with its
-            own one are left out, and so are values that the chosen algorithm does not allow.
+            own one are left out, and so are values that the chosen task or algorithm does not allow.
         new: whether a run is about to start with it; the run that `search.init_from` names must then exist.
         searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
         name: what an error calls a `source` that is no file.
@@ -168,7 +168,7 @@ def judge(parsed: Parsed, known: Known, *, new: bool, searches: bool = True) -> 
     task, settings, unknown = _chosen(given, unusable, known)
     if settings is not None:
         if _is_replaced("task.environment", file, wanted) and task is not None:
-            left_out |= (refused := _refused_by_task(file, wanted, task, settings, known))
+            left_out |= (refused := _refused_by_task(parsed, file, task, settings, known))
             file, given = _without(file, refused), _without(given, refused)
         chosen = Values(given, task, settings, known.rollouts)
         left_out |= (others := _of_another_method(file, wanted, chosen, settings, known.algorithms))
@@ -253,8 +253,7 @@ def _of_another_task(file: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict
 
     def is_of_task(key: str) -> bool:
         is_target = key.startswith("budget.target_") and file[key] is not None  # a fitness, which is that of its task
-        has_units = key == "map.bounds" and not asks(key, file[key])  # those of its task's descriptor
-        return is_target or has_units or key.startswith(TASK_OPTIONS) or key in CHOICES
+        return is_target or key.startswith(TASK_OPTIONS) or key in CHOICES
 
     return {key: _replaces_task(wanted) for key in file if key not in wanted and is_of_task(key)}
 
@@ -264,22 +263,50 @@ def _replaces_task(wanted: Mapping[str, Any]) -> str:
 
 
 def _refused_by_task(
-    file: Mapping[str, Any], wanted: Mapping[str, Any], task: TaskSpec, settings: type[SearchConfig], known: Known
+    parsed: Parsed, file: Mapping[str, Any], task: TaskSpec, settings: type[SearchConfig], known: Known
 ) -> dict[str, str]:
-    """See `ConfigOrigin.left_out`: what a task that overrides replace allowed, and the new one does not, such as noise
-    on actions that are now choices. One such value may hide another."""
-    why = _replaces_task(wanted)
-    left_out = {key: why for key in file if key not in wanted and _is_idle(key, task, None)}
-    while True:
-        given = {
-            key: value for key, value in {**file, **wanted}.items() if key not in left_out and not asks(key, value)
-        }
-        invalid = value_problems(given, settings, known.algorithms)
-        values = Values(given, task, settings, known.rollouts, invalid)
-        refused = {problem.field for problem in problems_of(values, TASK_RULES)} & {*file} - {*wanted, *left_out}
-        if not refused:
-            return left_out
-        left_out |= {key: why for key in file if key in refused}
+    """See `ConfigOrigin.left_out`: values that a task allowed which overrides replace, and the new one does not, such
+    as noise on actions that are now choices; and bounds of the map, which are in units of the old descriptor.
+
+    A value that is wrong with the old task, too, is left to be reported.
+    """
+    why = _replaces_task(parsed.wanted)
+    said = {key: value for key, value in {**file, **parsed.wanted}.items() if not asks(key, value)}
+    invalid = value_problems(said, settings, known.algorithms)
+    movable = said.keys() - parsed.wanted.keys() - invalid.keys()
+
+    def refused(values: Values) -> set[str]:
+        return {str(problem.field) for problem in problems_of(values, TASK_RULES)} & movable
+
+    def gone(key: str) -> bool:
+        return key == "map.bounds" or (key in FIELDS and _is_idle(key, task, None))
+
+    left_out = {key: why for key in said if key in movable and gone(key)}
+    while True:  # one such value may hide another
+        values = Values(_without(said, left_out), task, settings, known.rollouts, invalid)
+        more = refused(values).difference(left_out)
+        if more:
+            more -= refused(_before(parsed, task, settings, known, invalid))
+        if not more:
+            break
+        left_out |= {key: why for key in said if key in more}
+    kinds = {key: values[key] for key in left_out if key.endswith(f".{KIND}")}
+    of_them = [key for key in movable if kind_of(key) in kinds and lacks(key, kinds[kind_of(key)], settings)]
+    return left_out | dict.fromkeys(of_them, why)
+
+
+def _before(
+    parsed: Parsed, new: TaskSpec, settings: type[SearchConfig], known: Known, invalid: Collection[str]
+) -> Values:
+    """Values with the task of the file, and with those overrides that are not about the new task, as an output is by
+    which actions are chosen."""
+    of_new = ("task.", "policy.output") if new.discrete_actions else ("task.",)
+    others = {key: value for key, value in parsed.wanted.items() if not key.startswith(of_new)}
+    given = {key: value for key, value in {**parsed.file, **others}.items() if not asks(key, value)}
+    task = None
+    with contextlib.suppress(ConfigError):  # it is not installed here
+        task, _, _ = _chosen(given, (), known)
+    return Values(given, task, settings, known.rollouts, invalid)
 
 
 def _of_another_method(

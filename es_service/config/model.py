@@ -81,7 +81,7 @@ class ConfigOrigin:
     """What was given, by dotted key."""
     left_out: Mapping[str, str] = field(compare=False)
     """Keys of the file that go with the task, the method or the kind of a part that overrides have replaced, or whose
-    values the new method does not allow; each with a clause that says so."""
+    values the new task or method does not allow; each with a clause that says so."""
     kept: Mapping[str, Kept] = field(compare=False)
     """Keys of the file that keep their values although overrides replace the method, or the kind of a part, for which
     they were written, and the new one has another default."""

@@ -34,7 +34,6 @@ from es_service.logs import logger
 from es_service.protocol.child import require_same_process
 from es_service.protocol.episodes import DispatchCounts, Wait, pieces_of, together
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
-from es_service.protocol.policies import ALL_TOGETHER
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
@@ -264,7 +263,7 @@ class Engine(Generic[AnyTransport]):
             work = [piece for subject_chunk in work for piece in pieces_of(subject_chunk, episodes)]
         parts = self._parts(work)
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
-        policies = ALL_TOGETHER if self._state.limits.cores > 1 else self._state.limits.policies_together
+        policies = self._state.limits.policies_together
         self._work, self._results = {item_id: together(part, policies) for item_id, part in parts}, {}
         self._computing.begin({item_id.kind for item_id, _ in parts}, time.monotonic())
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))

@@ -71,7 +71,7 @@ class Limits:
     episodes_together: int | None = None
     """Most episodes of an evaluation or policy chunk that are sent together; None: whole chunks."""
     policies_together: int = POLICY_SLOTS
-    """Most policies with one episode each that a worker with one core is sent as one chunk."""
+    """Most policies with one episode each that a worker is sent as one chunk."""
     max_failures_in_a_row: int = 3
     """Number of consecutive exceptions after which a worker is killed and replaced."""
     restart_backoff_s: float = 1.0

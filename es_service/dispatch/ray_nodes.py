@@ -10,6 +10,7 @@ from types import ModuleType
 
 from es_service.dispatch.events import Limits
 from es_service.errors import StartError
+from es_service.protocol.policies import ALL_TOGETHER
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ def layout(
         limits = replace(limits, waits_for_place=False)
     growth = Growth(-(-most // cpus), ahead) if grows else None
     workers = with_work(limits.workers, cpus, most) if growth is None else growth.wanted(nodes, before=1)
+    if cpus > 1 and not gpus:  # its actors have several cores, which share what comes together
+        limits = replace(limits, policies_together=ALL_TOGETHER)
     return claim, replace(limits, workers=workers, cores=cpus), growth
 
 

@@ -148,7 +148,7 @@ def finish(
 def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:
     """A generation's row of the history, and the table of what it has evaluated."""
     state, before, told, cell_N = finished.state, finished.before, finished.told, finished.cell_N
-    archive, measured = finished.archive, dict(search.config.novelty)
+    archive, measured = finished.archive, {**dict(search.config.novelty), "threads": 1}
     novelty_N = np.full(len(told), np.nan) if archive is None else novelty(archive, told.descriptor_N_B, **measured)
     table = evaluated_table(told, search.task, cell_N, finished.start_cells, novelty_N)
     at = fittest(told)  # subject of the history's row

@@ -30,7 +30,6 @@ from es_service.protocol.machine import architecture
 Sources = Mapping[str, str]
 """Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits; or name
 of a library that defines a task or a search -> its version."""
-HASH_DIGITS = 32
 OURS = ("es_service", "workers")
 WORKERS = ("workers", "es_service.protocol")
 """Packages with which workers compute."""
@@ -368,4 +367,9 @@ def _imports(content: bytes, package: str) -> tuple[str, ...]:
 
 def sha256(content: bytes) -> str:
     """The hash of a source file in `Sources`."""
-    return hashlib.sha256(content).hexdigest()[:HASH_DIGITS]
+    return hashlib.sha256(content).hexdigest()[:32]
+
+
+def is_hash(text: str) -> bool:
+    """Whether a value of `Sources` is a hash; else it is a version."""
+    return re.fullmatch("[0-9a-f]{32}", text) is not None

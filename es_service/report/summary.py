@@ -17,7 +17,7 @@ from es_service.config.text import in_line
 from es_service.errors import counted
 from es_service.protocol.machine import CODE, code_text
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.sources import HASH_DIGITS, in_words
+from es_service.protocol.sources import in_words, is_hash
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.certified import Certified, failed_sentence, measure_of, pairs_sentence, tries_sentence
@@ -234,7 +234,7 @@ def duration(seconds: float) -> str:
 def _versions(platform: Mapping[str, Any]) -> str:
     """Versions of Python, of its packages, and of the library that defines the task or the search."""
     code = platform.get(CODE, {}).items()
-    libraries = {name: text for name, text in code if len(text) < HASH_DIGITS}  # recorded in the place of hashes
+    libraries = {name: text for name, text in code if not is_hash(text)}  # in the place of hashes
     packages = {name: text for name, text in platform.items() if name not in ("cpu", "workers", CODE)}
     return ", ".join(f"{name} {text}" for name, text in (packages | libraries).items())
 

@@ -23,6 +23,7 @@ from es_service.errors import ConfigError, NotInRunError, Problem
 from es_service.loop.blocks import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, names_of, state_of, stored, value_of
 from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Policy
+from es_service.protocol.episodes import METRICS
 from es_service.protocol.messages import Moments
 from es_service.runs.certification import certify_run, default_measure
 from es_service.runs.certified import EPISODES, Certified, certified_policies
@@ -47,7 +48,7 @@ OBSERVED = ("policy.observation_clip", NORMALISED)
 SCORE_KEYS = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
 """Keys that change the highest fitness of a population, but not the meaning of an evaluation."""
 RECORDED = ("task.metrics",)
-"""Keys that change what is recorded of an episode, and no fitness."""
+"""Keys that change what is recorded of an episode, and no fitness, unless the search reads metrics."""
 ROWS_AT_ONCE = 4096
 """History rows that are held in memory together."""
 
@@ -110,7 +111,8 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     snapshot = origin.at(generation, named=named_by_all)
     at, state = snapshot.generation, state_of(snapshot.nodes, snapshot.generation, 0.0)
     changed = {name for name, _, _ in changes_from(origin.constants, config)}
-    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS, RECORDED)):
+    harmless = {*SCORE_KEYS, *(() if METRICS in config.search.outputs() else RECORDED)}
+    if any(name in OBSERVED or name.startswith("task.") for name in changed - harmless):
         state = _without_fitness(state)
     elif changed.intersection(SCORE_KEYS):
         # The highest fitness of a population is not comparable with that of a population of another size, or with

@@ -150,11 +150,11 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: Run
     if phase.name == "gradient":
         return [(NO_CENTRE, GradientChunk(1, i, weights_P, ask)) for ask in range(len(centres)) for i in ids]
     if phase.name == "rollout":
-        return [(centre, TrainingChunk(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
+        return [(centre, TrainingChunk(1, i, ask, ask)) for ask, centre in enumerate(centres) for i in ids]
     return [
         (replace(centre, parameters_D=centre.parameters_D.copy(), archive=None), chunk)
         for ask, centre in enumerate(centres)
-        for chunk in evaluation_chunks(1, config.search.evaluation_episodes, ask=ask)
+        for chunk in evaluation_chunks(1, config.search.evaluation_episodes, ask=ask, request=ask)
     ]
 
 
@@ -220,7 +220,7 @@ class EchoActor(WorkerActor):
             until = time.perf_counter() + SPIN_S
             while time.perf_counter() < until:
                 pass
-            return [spec.answers[_kind(one)] for one in work]
+            return [_for_chunk(spec.answers[_kind(one)], one) for one in work]
 
         self._joins = True  # as an actor with the cores of a node
         self._received, self._reports = Received(spec.parent_cache_bytes, Recipes.made), Reports(spec, self._cores)

@@ -120,6 +120,7 @@ def novelty(
     distance: Distance,
     newest: int | None = None,
     exclude_Q: ArrayLike | None = None,
+    threads: int | None = None,
 ) -> NDArray[np.float64]:
     """Mean distance of each query to its `neighbours` nearest entries, or to all entries if there are fewer.
 
@@ -134,6 +135,8 @@ def novelty(
         newest: number of the newest entries that count; None for all.
         exclude_Q: index of an entry that each query ignores, usually its own, or -1 for none; only for queries with one
             leading axis.
+        threads: most threads among which the queries are divided; None: one for each core of this machine, since the
+            workers wait while a search computes novelties.
 
     Returns:
         float64, with the leading axes of the queries.
@@ -144,9 +147,8 @@ def novelty(
     if newest is not None and newest < archive.size:
         excluded_Q = np.maximum(excluded_Q - (archive.size - newest), -1)
         archive = _newest(archive, newest)
-    # While a run computes novelties, its workers wait, so each core of this machine takes a share of the queries.
     entries = archive.descriptor_N_B, archive.tree
-    novelty_Q = mean_distances(*entries, query_Q_B, excluded_Q, neighbours, distance, usable_cpus())
+    novelty_Q = mean_distances(*entries, query_Q_B, excluded_Q, neighbours, distance, threads or usable_cpus())
     return novelty_Q.reshape(shape)
 
 

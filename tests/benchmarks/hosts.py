@@ -1,15 +1,15 @@
-"""What does a cluster of four hosts with 16 cores each make of its cores, and what does a host that is slow cost?
+"""What does a cluster make of its cores, and what does a host that is slow cost?
 
     python -m tests.benchmarks.hosts
     python -m tests.benchmarks.hosts --scale     # 4, 8, 16 hosts of 64 cores, beside the prediction of `bench scaling`
 
 Real are the driver's engine, Ray, its messages between hosts (network namespaces of this machine) and the node actor
 that divides a work item among its cores. Only a chunk is not: a core sleeps for as long as it would take, so that two
-cores can stand for 64, and answers with a result of the size of AntMaze's. Printed are JSON rows for one core, for all
-cores, and for all cores if one host is five times slower, with second copies of late work items and without, when a
-generation has many chunks or few. With `--scale`, a chunk sleeps for a second, as long as one of AntMaze takes, and
-`predicted` is what `bench scaling` expects from these times and the costs of messages that it measures here. Needs root
-and iproute2; nothing else should compute.
+cores can stand for 64, and answers with a result of the size of AntMaze's. Printed are JSON rows for one core; for four
+hosts with 16 cores each; and for these if one host is five times slower, with second copies of late work items and
+without, when a generation has many chunks or few. With `--scale`, a chunk sleeps for a second, as long as one of
+AntMaze takes, and `predicted` is what `bench scaling` expects from these times and the costs of messages that it
+measures here. Needs root and iproute2; nothing else should compute.
 """
 
 from __future__ import annotations

@@ -119,6 +119,32 @@ def test_what_another_task_forbids_goes_with_its_task_unless_it_is_asked_for():
         api.load_config(source | {"policy": {"action_noise": "quiet"}}, [there])
 
 
+@pytest.mark.parametrize(
+    ("changes", "overrides", "wrong"),
+    [
+        ({"compute": {"worker_memory_mb": 900}}, ["compute.inline_workers=threads"], "compute.worker_memory_mb: 900"),
+        ({"policy": {"output": "categorical", "action_noise": 0.1}}, [], "policy.action_noise: 0.1"),
+        ({"policy": {"action_noise": 0.1}}, ["policy.output=categorical"], "policy.action_noise: 0.1"),
+        ({"map": {"cells": [20, 20]}}, ["map.kind=cvt"], "map.cells: [20, 20]"),
+        ({"map": {"cells": [5000, 5000]}}, [], "map.cells: [5000, 5000]"),
+        ({"map": {"bounds": "nonsense"}}, [], "map.bounds: nonsense"),
+    ],
+)
+def test_what_is_wrong_with_the_old_task_too_is_reported(changes, overrides, wrong):
+    with pytest.raises(ConfigError, match=re.escape(wrong)):
+        api.load_config(MINIMAL | changes, ["task.environment=ant_maze", *overrides])
+
+
+def test_what_a_function_has_no_policy_for_goes_with_the_task_unless_it_is_wrong():
+    there = "task.environment=function:tests.workers.functions:hill"
+    noise = {"search": {**MINIMAL["search"], "noise": {"kind": "low_rank", "rank": 1}}}
+    config = api.load_config(MINIMAL | noise | {"policy": {"hidden": [8]}}, [there])
+    assert {"policy.hidden", "search.noise.kind", "search.noise.rank"} <= config.made.left_out.keys()
+    for wrong in ({"policy": {"action_noize": 0.1}}, {"policy": {"hidden": "wrong"}}):
+        with pytest.raises(ConfigError, match=f"policy.{next(iter(wrong['policy']))}: "):
+            api.load_config(MINIMAL | wrong, [there])
+
+
 def test_bounds_of_a_descriptor_go_with_its_task():
     source = MINIMAL | {"map": {"bounds": [[0.0, 1.0], [0.0, 1.0]]}}
     config = api.load_config(source, ["task.environment=ant_trap"])
