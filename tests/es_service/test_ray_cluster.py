@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from test.support import catch_unraisable_exception
@@ -15,6 +16,7 @@ from es_service.config.workload import ANY_NUMBER
 from es_service.dispatch import ray_cluster, ray_nodes
 from es_service.dispatch.events import Limits
 from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol.policies import ALL_TOGETHER, POLICY_SLOTS
 from tests.system.processes import wait_for
 
 
@@ -141,6 +143,15 @@ def test_too_little_work_makes_fewer_actors_and_not_smaller_ones(nodes, workers,
         ours=False,
     )
     assert (limits.workers, limits.cores) == (actors, cores)
+    assert (limits.policies_together == ALL_TOGETHER) == (cores > 1), "which several cores share"
+
+
+def test_an_actor_with_a_gpu_is_sent_no_more_policies_than_one_core():
+    """It has no cores of its own that would take them apart."""
+    alive = [{"NodeID": "0", "Resources": {"CPU": 8.0, "GPU": 1.0}, "Alive": True}]
+    ray: Any = SimpleNamespace(nodes=lambda: alive)
+    claim, limits, _ = ray_nodes.layout(ray, Limits(8), 8, 1.0, 8, grows=False, ours=False)
+    assert (claim.cpus, claim.gpus, limits.policies_together) == (8, 1.0, POLICY_SLOTS)
 
 
 def test_nodes_without_cores_and_dead_ones_do_not_count():
