@@ -306,6 +306,8 @@ def test_the_table_that_chooses_a_method_has_medians_of_certified_values():
 def test_every_method_has_its_section(name):
     guide = TEXT["configs/methods.md" if name in OURS else "configs/own_searches.md"]
     assert re.search(rf"^## .*`{name}`$", guide, re.MULTILINE)
+    for table in ("configs/methods.md", USING):  # one row each, or beside others
+        assert name not in OURS or re.search(rf"^\|.*`{name}`.*\|", TEXT[table], re.MULTILINE), table
 
 
 def test_every_shipped_config_is_named():
