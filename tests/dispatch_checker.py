@@ -31,7 +31,7 @@ def check_dispatch(folder: Path) -> dict[str, int]:
     entries = read_dispatch_log(folder)
     assert entries[0]["is"] == "Session"
     counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "copied", "lost", "compiled"), 0)
-    newest = None
+    newest, begun = None, -1
     up: set[int] = set()
     compiled: set[tuple[int, str]] = set()
     holders: dict[tuple, set[int]] = {}
@@ -42,14 +42,17 @@ def check_dispatch(folder: Path) -> dict[str, int]:
         worker = entry.get("worker")
         match entry["is"]:
             case "Session":
-                if counts["sessions"]:  # a kill may come between a commit and its line here
-                    assert entry["after_generation"] in (newest, 0 if newest is None else newest + 1)
+                after = entry["after_generation"]
+                if counts["sessions"] and after != newest:
+                    # A kill has come between a commit, perhaps of several generations, and their lines here.
+                    assert (-1 if newest is None else newest) < after <= begun, "stored, and never computed"
                 newest = entry["after_generation"]
                 up, compiled, holders, waiting = set(), set(), {}, set()
                 counts["sessions"] += 1
             case "Submit":
                 assert not waiting, f"{waiting} were never delivered"
                 waiting = {tuple(item) for item in entry["items"]}
+                begun = max(WorkItemId(*item).generation for item in waiting)
                 assert len(waiting) == len(entry["items"])
                 assert not waiting & holders.keys(), "submitted twice in one session"
             case "WorkerUp":
