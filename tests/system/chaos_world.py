@@ -255,7 +255,8 @@ class World(Machines):
         self.ends.append(End(ended.returncode, printed))
         # Ray itself ends a driver that asks a head node for something in the instant in which that is lost.
         by_ray = "WrongClusterID" in printed
-        says_why = re.search("^error: ", printed, re.MULTILINE) and not re.search("Traceback|StackTrace", printed)
+        ours = "Traceback" if "(raylet)" in printed else "Traceback|StackTrace"  # Ray's own may print the latter
+        says_why = re.search("^error: ", printed, re.MULTILINE) and not re.search(ours, printed)
         by_itself = ended.returncode == 1 and says_why
         assert self.may_end, self.ends[-1]
         assert by_itself or by_ray or ended.returncode in KILLED, self.ends[-1]
