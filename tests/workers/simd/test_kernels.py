@@ -124,8 +124,7 @@ def test_long_code_in_parts_has_the_same_bits(target: Target, tmp_path, monkeypa
 
     x = np.random.default_rng(0).normal(0, 1, (LANES, 12)).astype(np.float32)
     whole = compile_kernel(function, one_of(x), target=target, folder=tmp_path / "whole")
-    monkeypatch.setattr(emit, "MOST_UNPARTED", 20)
-    monkeypatch.setattr(emit, "PART", 7)
+    monkeypatch.setattr(emit.Writer, "part", 7)
     graph, inputs, outputs = trace_jaxpr(jax.make_jaxpr(function)(one_of(x)))
     assert emit.emit(graph, outputs, inputs, target).count("_never:") > 20
     parts = compile_kernel(function, one_of(x), target=target, folder=tmp_path / "parts")

@@ -20,11 +20,9 @@ MOST_SLOTS = 16384
 MOST_LIVE = 16384
 """Most values that may be needed at the same time, of which the stack holds what registers cannot: one MiB."""
 
-MOST_UNPARTED = 20_000
-"""Most operations of straight code that stay one basic block. LLVM schedules a block and assigns its registers in a
-time that grows faster than its length; a humanoid of MJX in parts takes a third less, and its code is as fast."""
-PART = 1000
-"""Operations of each basic block of longer code."""
+PART = 300
+"""Operations of each basic block of longer straight code. LLVM chooses and schedules the instructions of a block in a
+time that grows faster than its length: an ant of MJX in parts compiles in half the time, and its code is as fast."""
 
 
 def emit(graph: Graph, outputs: Sequence[int], inputs: int, target: Target) -> str:
@@ -106,6 +104,10 @@ def inline(builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], given
 
 
 class Writer:
+    """Writer of a graph's instructions, each on vectors."""
+
+    part = PART
+
     def __init__(
         self,
         builder: FunctionBuilder,
@@ -144,9 +146,8 @@ class Writer:
 
     def region(self, region: Region) -> None:
         """Write straight code and the loops in it."""
-        parted = len(region.steps) > MOST_UNPARTED
         for number, step in enumerate(region.steps):
-            if parted and number % PART == PART - 1:
+            if number % self.part == self.part - 1:
                 self.builder.part()
             if isinstance(step, Region):
                 self.loop(step)

@@ -168,7 +168,7 @@ class FunctionBuilder:
         never = self.value(f"icmp eq ptr {self.parameters[0].split()[-1]}, null")
         self.do(f"br i1 {never}, label %{label}_never, label %{label}")
         self.label(f"{label}_never")
-        self.do("ret void")
+        self.do("unreachable")  # and not a return, which LLVM would think as likely as what follows
         self.label(label)
 
     def any(self, words: str, lanes: int | None = None) -> str:

@@ -159,6 +159,7 @@ class Noted(NamedTuple):
 class QuickWriter(Writer):
     """Writer of a graph's instructions, one lane at a time, with quick quotients and roots."""
 
+    part = 20_000  # the ants of Brax's springs stay one block, as they were measured
     noted: Noted
     flag: int
     """Slot of the word that says whether the function must be computed again."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from workers.simd.graph.graph import Graph, Loop, depending, live, reached
-from workers.simd.graph.operations import NUMPY_DTYPES
+from workers.simd.graph.operations import NUMPY_DTYPES, OPERATIONS
 from workers.simd.graph.operations import compute as compute_operation
 
 
@@ -45,15 +45,19 @@ class Schedule(NamedTuple):
     """Sum or difference -> the product it is fused with; both become one operation, which is rounded once."""
 
 
-def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
-    """Schedule of a graph in which each node is computed as late as possible, just before its first use."""
+def schedule(graph: Graph, outputs: Sequence[int], *, fuse: bool = True) -> Schedule:
+    """Schedule of a graph in which each node is computed as late as possible, just before its first use.
+
+    Args:
+        fuse: products with their sums.
+    """
     alive = live(graph, outputs)
     numbers = sorted({graph.keys[node][2] for node in alive if graph.keys[node][0] == "carry"})
     bodies = {number: depending(graph, graph.loops[number]) & alive for number in numbers}
     home: dict[int, int | None] = dict.fromkeys(alive)
     for number in sorted(numbers, key=lambda number: -len(bodies[number])):
         home.update(dict.fromkeys(bodies[number], number))
-    fused = _fused(graph, alive, home)
+    fused = _fused(graph, alive, home) if fuse else {}
 
     def needs(node: int) -> tuple[int, ...]:
         """As `graph.needs`, but with a fused product replaced by its factors."""
@@ -126,6 +130,17 @@ def _fused(graph: Graph, nodes: Collection[int], home: Mapping[int, int | None])
     return fused
 
 
+class _Group(NamedTuple):
+    """Equal operations that need no result of each other."""
+
+    name: str
+    negated: int | None
+    """Which argument is taken with the other sign; None for a plain operation."""
+    nodes: list[int]
+    arguments: list[tuple[int, ...]]
+    """Argument nodes of each node."""
+
+
 def evaluate(
     graph: Graph,
     outputs: Sequence[int],
@@ -138,56 +153,114 @@ def evaluate(
 
     Args:
         words: uint32 [input word, lane].
-        operation: function (node, arguments) -> result of an operation that is not fused, each time it is computed;
-            None for the results with the bits of kernels.
+        operation: function (node, arguments) -> result of an operation, each time it is computed; None for the results
+            with the bits of kernels. It needs products that are not fused.
         fuse: products with their sums, as kernels do.
     """
-    order = schedule(graph, outputs)
-    operation = operation or (lambda node, arguments: compute_operation(graph.keys[node][0], arguments))
-    values: dict[int, np.ndarray] = {}
-    given: dict[int, np.ndarray] = {}
+    assert operation is None or not fuse
+    order = schedule(graph, outputs, fuse=fuse)
+    alive = sorted(live(graph, outputs))
+    row_of = np.full(len(graph.keys), -1)
+    row_of[alive] = np.arange(len(alive))
+    words_N_L = np.zeros((len(alive), words.shape[1]), np.uint32)
+    for row, key in enumerate(graph.keys[node] for node in alive):
+        if key[0] == "const":
+            words_N_L[row] = _words(np.asarray(graph.constant(alive[row])))
+        elif key[0] == "input":
+            words_N_L[row] = words[key[2]]
 
-    def value(node: int) -> np.ndarray:
-        if node in values:
-            return values[node]
-        key = graph.keys[node]
-        if key[0] not in ("const", "input"):
-            return computed(node)  # a product that only sums take in
-        if node not in given and key[0] == "const":
-            given[node] = np.full(words.shape[1], graph.constant(node))
-        elif node not in given:
-            word = words[key[2]]
-            given[node] = word != 0 if key[1] == "b" else word.view(NUMPY_DTYPES[key[1]])
-        return given[node]
+    def rows(nodes: Sequence[Any]) -> np.ndarray:
+        found = row_of[np.array(nodes, np.intp)]
+        assert (found >= 0).all(), "only nodes on which outputs depend have values"
+        return found
 
-    def computed(node: int) -> np.ndarray:
-        product = order.fused.get(node) if fuse else None
-        arguments = [value(argument) for argument in graph.arguments(node)]
-        if product is None:
-            return operation(node, arguments)
-        left, right = graph.arguments(node)
-        a, b = (value(argument) for argument in graph.arguments(product))
-        if graph.keys[node][0] == "sub" and product == right:
-            return compute_operation("fma", [-a, b, value(left)])
-        if graph.keys[node][0] == "sub":
-            return compute_operation("fma", [a, b, -value(right)])
-        return compute_operation("fma", [a, b, value(right if product == left else left)])
+    def values(at: Any, dtype: str) -> np.ndarray:
+        found = words_N_L[at]
+        return found != 0 if dtype == "b" else found.view(NUMPY_DTYPES[dtype])
 
-    def run(region: Region) -> None:
-        for step in region.steps:
-            if not isinstance(step, Region):
-                values[step] = computed(step)
-                continue
-            loop = step.loop
-            assert loop is not None
-            carried = {k: value(loop.inits[k]) for k in step.carried}
+    def straight(steps: Sequence[Any]) -> Callable[[], None]:
+        """Function that computes nodes, equal operations together."""
+        groups = [
+            (group, OPERATIONS[group.name].takes, rows(group.nodes), rows(group.arguments).T)
+            for group in _groups(graph, order.fused, steps)
+        ]
+
+        def run() -> None:
+            for group, takes, nodes, arguments in groups:
+                if operation is not None:
+                    for number, node in enumerate(group.nodes):
+                        given = [values(at[number], dtype) for at, dtype in zip(arguments, takes, strict=True)]
+                        words_N_L[nodes[number]] = _words(operation(node, given))
+                    continue
+                given = [values(at, dtype) for at, dtype in zip(arguments, takes, strict=True)]
+                if group.negated is not None:
+                    given[group.negated] = -given[group.negated]
+                words_N_L[nodes] = _words(compute_operation(group.name, given))
+
+        return run
+
+    def repeated(region: Region) -> Callable[[], None]:
+        """Function that runs a loop."""
+        loop, body = region.loop, planned(region)
+        assert loop is not None
+        starts, carries, outs = (
+            rows([nodes[k] for k in region.carried]) for nodes in (loop.inits, loop.carries, loop.outs)
+        )
+        read = [k for k in region.carried if row_of[loop.results[k]] >= 0]
+        results, ends = (rows([nodes[k] for k in read]) for nodes in (loop.results, loop.carries))
+        active = None if loop.active is None else rows([loop.carries[loop.active]])
+
+        def run() -> None:
+            words_N_L[carries] = words_N_L[starts]
             for _ in itertools.count() if loop.trips is None else range(loop.trips):
-                if loop.active is not None and not carried[loop.active].any():
+                if active is not None and not words_N_L[active].any():
                     break
-                values.update({loop.carries[k]: array for k, array in carried.items()})
-                run(step)
-                carried = {k: value(loop.outs[k]) for k in step.carried}
-            values.update({loop.results[k]: array for k, array in carried.items()})
+                body()
+                words_N_L[carries] = words_N_L[outs]
+            words_N_L[results] = words_N_L[ends]
 
-    run(order.region)
-    return [value(node) for node in outputs]
+        return run
+
+    def planned(region: Region) -> Callable[[], None]:
+        """Function that computes a region once."""
+        parts: list[Callable[[], None]] = []
+        begin = 0
+        for end, step in enumerate([*region.steps, None]):
+            if not isinstance(step, int):
+                parts.append(straight(region.steps[begin:end]))
+                begin = end + 1
+            if isinstance(step, Region):
+                parts.append(repeated(step))
+
+        def run() -> None:
+            for part in parts:
+                part()
+
+        return run
+
+    planned(order.region)()
+    return [values(row, graph.dtypes[node]) for row, node in zip(rows(outputs), outputs, strict=True)]
+
+
+def _words(values: Any) -> np.ndarray:
+    """Values as words of 32 bits; a bool is 0 or 1."""
+    return values.astype(np.uint32) if values.dtype == bool else values.view(np.uint32)
+
+
+def _groups(graph: Graph, fused: Mapping[int, int], steps: Sequence[int]) -> list[_Group]:
+    """The operations of straight code in an order in which each has its arguments, with equal ones together."""
+    depth: dict[int, int] = {}
+    found: dict[tuple[int, str, int | None], _Group] = {}
+    for node in steps:
+        name, negated, arguments = graph.keys[node][0], None, graph.arguments(node)
+        product = fused.get(node)
+        if product is not None:
+            first, second = arguments
+            if name == "sub":
+                negated = 0 if product == second else 2
+            name, arguments = "fma", (*graph.arguments(product), first if product == second else second)
+        depth[node] = 1 + max((depth.get(argument, 0) for argument in arguments), default=0)
+        group = found.setdefault((depth[node], name, negated), _Group(name, negated, [], []))
+        group.nodes.append(node)
+        group.arguments.append(arguments)
+    return [found[key] for key in sorted(found, key=lambda key: key[0])]
