@@ -140,11 +140,11 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
     return read(certified)
 
 
-def read(path: Path = RESULTS) -> pd.DataFrame:
+def read(path: Path) -> pd.DataFrame:
     """A table of results, without rows if there is no file."""
     if not path.exists():
         return pd.DataFrame(columns=RUN)
-    return pd.read_csv(path, converters={"settings": str})
+    return pd.read_csv(path, dtype={"settings": object}).fillna({"settings": ""})
 
 
 def keep(rows: pd.DataFrame) -> bool:
@@ -153,7 +153,7 @@ def keep(rows: pd.DataFrame) -> bool:
         rows[[*RUN, "env_steps", "cpu_s", "return_mean", "elsewhere_return_mean"]].to_string(header=False), flush=True
     )
     if not rows.settings.iloc[0]:
-        table = read()
+        table = read(RESULTS)
         is_old = (table[RUN] == rows[RUN].iloc[0]).all(axis="columns")
         kept = [part for part in (table.loc[~is_old], rows) if len(part)]
         pd.concat(kept).sort_values(by=[*RUN, "env_steps"]).to_csv(RESULTS, index=False, lineterminator="\n")
@@ -195,7 +195,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of a trial")
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
-    known = {tuple(row) for row in read()[RUN].itertuples(index=False)}
+    known = {tuple(row) for row in read(RESULTS)[RUN].itertuples(index=False)}
     wanted = [
         Wanted(task, policy, seed, tuple(given.set))
         for task in given.task
@@ -205,7 +205,7 @@ def main() -> None:
     ]
     if not given.table:
         compute(wanted, run_one, keep, RUNS)
-    print(in_words(read()))
+    print(in_words(read(RESULTS)))
 
 
 if __name__ == "__main__":

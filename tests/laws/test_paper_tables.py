@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tests.benchmarks import certified, paper, paper_tables
+from tests.benchmarks import certified, certified_gymnasium, paper, paper_tables
 from tests.benchmarks.paper_readings import AT, CURVE_AT, READINGS, column, curve, measured, readings
 
 
@@ -162,3 +162,14 @@ def test_certified_rows_replace_those_of_the_same_run_and_the_median_is_over_see
     assert "**20** (10 to 50, 3 seeds) | **2,000** (2,000 to 2,000, 2 seeds) |" in certified.in_words(table)
     wanted = [certified.Wanted(Path("ant_trap_es.yaml"), seed, (10**7, 10**8)) for seed in range(4)]
     assert [one.seed for one in certified.missing(wanted, table)] == [1, 3]
+
+
+def test_rows_of_a_run_without_settings_are_kept_and_known_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(certified_gymnasium, "RESULTS", tmp_path / "table.csv")
+    run = {"task": "Hopper-v5", "policy": "linear", "settings": "", "seed": 0, "cpu_s": 1.0, "return_mean": 5.0}
+    rows = pd.DataFrame([{**run, "env_steps": steps, "elsewhere_return_mean": 5.0} for steps in (10, 20)])
+    rows.to_csv(tmp_path / "of_run.csv", index=False)
+    for _ in range(2):
+        certified_gymnasium.keep(certified_gymnasium.read(tmp_path / "of_run.csv"))
+    table = certified_gymnasium.read(tmp_path / "table.csv")
+    assert list(table.settings) == ["", ""] and list(table.env_steps) == [10, 20]
