@@ -172,4 +172,5 @@ def test_rows_of_a_run_without_settings_are_kept_and_known_again(tmp_path, monke
     for _ in range(2):
         certified_gymnasium.keep(certified_gymnasium.read(tmp_path / "of_run.csv"))
     table = certified_gymnasium.read(tmp_path / "table.csv")
-    assert list(table.settings) == ["", ""] and list(table.env_steps) == [10, 20]
+    assert list(table.settings) == ["", ""]
+    assert list(table.env_steps) == [10, 20]
