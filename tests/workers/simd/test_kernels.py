@@ -123,6 +123,7 @@ def test_long_code_in_parts_has_the_same_bits(target: Target, tmp_path, monkeypa
         return jnp.cumsum(z * y) - jnp.exp(-(z * z))
 
     x = np.random.default_rng(0).normal(0, 1, (LANES, 12)).astype(np.float32)
+    monkeypatch.setattr(emit.Writer, "part", 10**9)
     whole = compile_kernel(function, one_of(x), target=target, folder=tmp_path / "whole")
     monkeypatch.setattr(emit.Writer, "part", 7)
     graph, inputs, outputs = trace_jaxpr(jax.make_jaxpr(function)(one_of(x)))

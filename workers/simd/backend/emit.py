@@ -20,10 +20,6 @@ MOST_SLOTS = 16384
 MOST_LIVE = 16384
 """Most values that may be needed at the same time, of which the stack holds what registers cannot: one MiB."""
 
-PART = 300
-"""Operations of each basic block of longer straight code. LLVM chooses and schedules the instructions of a block in a
-time that grows faster than its length: an ant of MJX in parts compiles in half the time, and its code is as fast."""
-
 
 def emit(graph: Graph, outputs: Sequence[int], inputs: int, target: Target) -> str:
     """LLVM IR of `void kernel(ptr in, ptr out, i64 blocks)` for a target.
@@ -106,7 +102,10 @@ def inline(builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], given
 class Writer:
     """Writer of a graph's instructions, each on vectors."""
 
-    part = PART
+    part = 300
+    """Operations of a basic block of longer straight code. LLVM chooses and schedules the instructions of a block in a
+    time that grows faster than its length: an ant of MJX in parts compiles in half the time, and its code is as fast
+    with AVX2."""
 
     def __init__(
         self,

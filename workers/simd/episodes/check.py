@@ -27,7 +27,7 @@ from workers.simd.episodes.program import EpisodeProgram
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.graph import Graph
 from workers.simd.graph.operations import compute
-from workers.simd.graph.schedule import evaluate
+from workers.simd.graph.schedule import as_words, evaluate
 
 Floats = NDArray[np.float32]
 WeightsOf = Callable[[NDArray[np.intp], bool], Floats]
@@ -148,7 +148,7 @@ def check_kernel(kernel: Kernel, graph: Graph, outputs: list[int], given_L: np.n
     words = pack([given_L], kernel.target.width)
     results = aligned((len(words), kernel.words_out, kernel.target.width))
     kernel.run(words, results)
-    require_same(_by_lane(results), as_words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
+    require_same(_by_lane(results), output_words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
 
 
 def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
@@ -180,7 +180,7 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     x_I_L = np.stack(evaluate(normalised_observation, seen, np.concatenate([carry_L, *statistics])))
     action_A_L = policy(spec.policy, inputs_O, x_I_L, weights_of, **moved)
     words = np.concatenate([carry_L, statistics[0], x_I_L.view(np.uint32), action_A_L.view(np.uint32), keys_L.T])
-    require_same(_by_lane(carries), as_words(evaluate(advance, after, words)), f"a step of {spec.environment}")
+    require_same(_by_lane(carries), output_words(evaluate(advance, after, words)), f"a step of {spec.environment}")
 
 
 def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> None:
@@ -211,6 +211,6 @@ def _by_lane(carries: Words) -> np.ndarray:
     return np.concatenate(list(carries), axis=1)[:, :LANES].copy()
 
 
-def as_words(values: list[np.ndarray]) -> np.ndarray:
-    """Values of outputs as words; a bool is 0 or 1."""
-    return np.stack([x.astype(np.uint32) if x.dtype == bool else x.view(np.uint32) for x in values])
+def output_words(values: list[np.ndarray]) -> np.ndarray:
+    """Values of outputs as words [output, lane]."""
+    return np.stack([as_words(x) for x in values])

@@ -26,7 +26,7 @@ from workers.environments import Environment, make_environment
 from workers.rollouts.backend import Examination
 from workers.simd.backend import cache
 from workers.simd.backend.native import OWN_VERSION, pack, words_of
-from workers.simd.episodes.check import as_words
+from workers.simd.episodes.check import output_words
 from workers.simd.episodes.kernel import DRAWN
 from workers.simd.episodes.rollout import training_program, why_not
 from workers.simd.frontend.trace import draws, jaxpr_digest, trace_jaxpr
@@ -224,7 +224,7 @@ def _computed(traced: _Traced, words: np.ndarray, record: Record = lambda *_: No
         return result
 
     with np.errstate(all="ignore"):
-        return as_words(evaluate(traced.graph, traced.outputs, words, operation, fuse=False))
+        return output_words(evaluate(traced.graph, traced.outputs, words, operation, fuse=False))
 
 
 def _differ(words: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -256,7 +256,7 @@ def _explained(traced: _Traced, words: np.ndarray, found: FaultPlace, step: int,
 
     def record(node: int, arguments: Sequence[Any], result: Any) -> None:
         """Note of the lane: nodes that differ, that are not finite, and of the latter those of finite arguments."""
-        of_jax, of_simd = as_words([result[lane : lane + 1], result[LANES + lane : LANES + lane + 1]])
+        of_jax, of_simd = output_words([result[lane : lane + 1], result[LANES + lane : LANES + lane + 1]])
         if _differ(of_jax, of_simd).any():
             differing.add(node)
         if graph.dtypes[node] == "f" and not np.isfinite(result[lane]):

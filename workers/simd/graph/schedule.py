@@ -165,7 +165,7 @@ def evaluate(
     words_N_L = np.zeros((len(alive), words.shape[1]), np.uint32)
     for row, key in enumerate(graph.keys[node] for node in alive):
         if key[0] == "const":
-            words_N_L[row] = _words(np.asarray(graph.constant(alive[row])))
+            words_N_L[row] = as_words(np.asarray(graph.constant(alive[row])))
         elif key[0] == "input":
             words_N_L[row] = words[key[2]]
 
@@ -190,12 +190,12 @@ def evaluate(
                 if operation is not None:
                     for number, node in enumerate(group.nodes):
                         given = [values(at[number], dtype) for at, dtype in zip(arguments, takes, strict=True)]
-                        words_N_L[nodes[number]] = _words(operation(node, given))
+                        words_N_L[nodes[number]] = as_words(operation(node, given))
                     continue
                 given = [values(at, dtype) for at, dtype in zip(arguments, takes, strict=True)]
                 if group.negated is not None:
                     given[group.negated] = -given[group.negated]
-                words_N_L[nodes] = _words(compute_operation(group.name, given))
+                words_N_L[nodes] = as_words(compute_operation(group.name, given))
 
         return run
 
@@ -242,7 +242,7 @@ def evaluate(
     return [values(row, graph.dtypes[node]) for row, node in zip(rows(outputs), outputs, strict=True)]
 
 
-def _words(values: Any) -> np.ndarray:
+def as_words(values: Any) -> np.ndarray:
     """Values as words of 32 bits; a bool is 0 or 1."""
     return values.astype(np.uint32) if values.dtype == bool else values.view(np.uint32)
 
