@@ -15,7 +15,8 @@ again. One that is interrupted goes on from its folder in runs/certified_methods
 are printed and added to results/certified_trials.csv.
 
 With `--physics mujoco`, the ants are trained with `physics: mujoco_euler` and certified in C MuJoCo, too, with Gym's
-model and its integrator RK4: the columns `elsewhere_*` of results/certified_mujoco.csv.
+model and its integrator RK4: the columns `elsewhere_*` of results/certified_mujoco.csv. The method `polish` is there
+MEMES for the first 3e7 steps, and from then on polish of its elites beyond the trap, whose marks count both.
 
 With `--map`, the methods that can fill a dominated map fill maps of these kinds, with as many slots as the grid has
 cells; results/certified_maps.csv has coverage and QD-score, too, which are counted by the same grid. There is one task
@@ -32,9 +33,11 @@ import pandas as pd
 
 from es_service import api
 from es_service.cli.sweep import seeds_of
+from es_service.config.model import RunConfig
 from es_service.protocol.machine import cpu_kind
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import certified_policies
+from es_service.runs.lineage import polish_config
 from tests.benchmarks.paper import commit, compute, folder_name
 from tests.helpers import workers_in_this_process
 
@@ -46,6 +49,8 @@ TRIALS, MUJOCO, MAPS = (RESULTS.with_name(f"certified_{name}.csv") for name in (
 TASKS = ("point_maze", "ant_maze", "ant_trap")
 SHIPPED = ("memes", "map_elites")
 METHODS = ("es", "ns_es", "nsr_es", "nsra_es", "me_es", *SHIPPED, "ars")
+POLISHED = "polish"
+"""The method that goes on from a run of MEMES."""
 MARKS = (1_000_000, 10_000_000, 100_000_000)
 RUN = ["task", "method", "settings", "seed"]
 COUNTED = ["coverage", "qd_score"]
@@ -53,8 +58,26 @@ SEEDS = 5
 EULER = "task.options.physics=mujoco_euler"
 IN_C = {"ant_maze": "gymnasium:es_service/AntMazeMujoco-v0", "ant_trap": "gymnasium:es_service/AntTrapMujoco-v0"}
 """Task -> the same one in C MuJoCo."""
-MUJOCO_SEEDS = {"memes": 5, "nsra_es": 5, "me_es": 3, "map_elites": 3, "ars": 3}
+MUJOCO_SEEDS = {"memes": 5, POLISHED: 5, "nsra_es": 5, "me_es": 3, "map_elites": 3, "ars": 3}
 """Method -> number of its seeds in MuJoCo, which begin with 0."""
+EXPLORED = 30_000_000
+"""Steps of MEMES whose elites are polished."""
+POLISH = {
+    "ant_trap": (
+        "search.candidate_choice=place",
+        "search.objective.kind=target",
+        "search.objective.descriptor=[30,0]",
+        "search.objective.radius=17",
+        "search.screened=60",
+        "search.candidates=6",
+        "search.round_generations=12",
+        "search.pairs=40",
+        "search.shaping.count=20",
+        "search.learning_rate_decay=0.997",
+        "search.learning_rate_limit=0.005",
+    )
+}
+"""Task -> settings of the polish, from trials with seeds 100 and 101: candidates are elites beyond the trap."""
 SLOTS = {"point_maze": 400, "ant_maze": 400, "ant_trap": 400, "kheperax": 2500}
 """Task -> cells of its grid, and slots of its dominated map."""
 KINDS = ("grid", "dominated")
@@ -96,11 +119,31 @@ class Wanted(NamedTuple):
     seed: int
     marks: tuple[int, ...]
     settings: tuple[str, ...] = ()
+    polished: bool = False
+    """Whether the config is that of a search whose elites are polished."""
 
     @property
     def name(self) -> str:
         """Of its folder."""
-        return folder_name(self.config, self.seed, self.settings)
+        return folder_name(self.config, self.seed, self.settings) + "_polished" * self.polished
+
+
+def config_at(wanted: Wanted, mark: int) -> RunConfig:
+    """The config with which a run goes on to a mark; what it polishes is computed if that is missing."""
+    fixed = ("compute.engine=inline", "compute.workers=1", f"seed={wanted.seed}")
+    others = ("budget.generations=null", "budget.target_certified=null")
+    if not wanted.polished:
+        return api.load_config(wanted.config, (*fixed, *others, f"budget.env_steps={mark}", *wanted.settings))
+    explored = explored_by(wanted)
+    api.run_or_resume(config_at(wanted._replace(polished=False), EXPLORED), explored)
+    left = mark - int(api.open_run(explored).history.env_steps.iloc[-1])
+    task = api.load_config(wanted.config).task.environment
+    return polish_config(explored, (*fixed, f"budget.env_steps={left}", *POLISH[task]))
+
+
+def explored_by(wanted: Wanted) -> Path:
+    """Folder of the run whose elites are polished."""
+    return RUNS / f"{wanted.name}_explored"
 
 
 def run_one(wanted: Wanted) -> pd.DataFrame:
@@ -109,23 +152,22 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
     in_c = IN_C.get(api.load_config(wanted.config).task.environment) if EULER in wanted.settings else None
     with workers_in_this_process():
         for number, mark in enumerate(wanted.marks):
-            limits = ("env_steps", mark), ("generations", "null"), ("target_certified", "null")
-            budget = (f"budget.{name}={value}" for name, value in limits)
-            fixed = ("compute.engine=inline", "compute.workers=1", f"seed={wanted.seed}")
-            api.run_or_resume(api.load_config(wanted.config, (*fixed, *budget, *wanted.settings)), folder)
+            api.run_or_resume(config_at(wanted, mark), folder)
             if number > max((policy.number for policy in certified_policies(folder)), default=-1):
                 certify_run(folder, workers=1, task=in_c)
     run = api.open_run(folder)
+    before = api.open_run(explored_by(wanted)).history.iloc[-1] if wanted.polished else {}
+    steps, seconds = (before.get(name, 0) for name in ("env_steps", "wall_clock_s"))
     rows = []
     for policy in certified_policies(folder):
-        then = run.history[run.history.env_steps >= wanted.marks[policy.number]].iloc[0]
+        then = run.history[run.history.env_steps >= wanted.marks[policy.number] - steps].iloc[0]
         of_run = {
             "task": run.config["task"]["environment"],
             "method": run.config["search"]["algorithm"],
             "settings": " ".join([wanted.config.stem, *wanted.settings]),
             "seed": wanted.seed,
-            "env_steps": int(then.env_steps),
-            "seconds": round(float(then.wall_clock_s)),
+            "env_steps": int(then.env_steps + steps),
+            "seconds": round(float(then.wall_clock_s + seconds)),
         }
         if {*wanted.settings}.intersection(f"map.kind={kind}" for kind in KINDS):
             of_run |= {name: float(then[name]) for name in COUNTED}
@@ -150,6 +192,7 @@ def keep(path: Path, rows: pd.DataFrame) -> bool:
 
 def config_of(task: str, method: str) -> Path:
     """The config of a method in the tables."""
+    method = "memes" if method == POLISHED else method
     task = "point_maze" if task in ELSEWHERE else task
     return (CONFIGS if method in SHIPPED else CONFIGS / "certified") / f"{task}_{method}.yaml"
 
@@ -162,12 +205,11 @@ def settings_of(task: str, kind: str) -> tuple[str, ...]:
 
 def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
     """Those that have no row at their last mark."""
-    known = {(row.settings, row.seed): row.env_steps for row in table.itertuples()}
+    known = {(row.settings, row.seed, row.method == POLISHED): row.env_steps for row in table.itertuples()}
     return [
-        wanted_run
-        for wanted_run in wanted
-        if known.get((" ".join([wanted_run.config.stem, *wanted_run.settings]), wanted_run.seed), 0)
-        < wanted_run.marks[-1]
+        run
+        for run in wanted
+        if known.get((" ".join([run.config.stem, *run.settings]), run.seed, run.polished), 0) < run.marks[-1]
     ]
 
 
@@ -179,7 +221,7 @@ def in_words(table: pd.DataFrame, columns: str = "") -> str:
     """
     head = ["method", *(f"{shown.title}, {mark:.0e}".replace("e+0", "e") for shown in SHOWN for mark in shown.marks)]
     lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
-    for method in METHODS:
+    for method in (*METHODS, POLISHED):
         cells = [
             _cell(table[(table.task == shown.task) & (table.method == method)], columns + shown.column, mark)
             for shown in SHOWN
@@ -227,7 +269,7 @@ def _number(value: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="+", default=list(TASKS), choices=(*TASKS, *ELSEWHERE))
-    parser.add_argument("--method", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--method", nargs="+", default=[*METHODS, POLISHED], choices=[*METHODS, POLISHED])
     parser.add_argument("--seeds", metavar="A:B", help="default: 0:5, or those that the table in MuJoCo has")
     parser.add_argument("--physics", choices=("spring", "mujoco"), default="spring")
     parser.add_argument("--map", nargs="+", choices=KINDS, default=[], help="kinds of maps to compare")
@@ -247,13 +289,19 @@ def main() -> None:
     able = MUJOCO_SEEDS if in_mujoco else MAPPED if given.map else METHODS
     methods = [method for method in given.method if method in able]
     count = dict.fromkeys(METHODS, SEEDS) | (MUJOCO_SEEDS if in_mujoco else {})
-    chosen = [("", given.config, SEEDS)] if trial else [(a, config_of(a, b), count[b]) for a in tasks for b in methods]
+    pairs = [(task, method) for task in tasks for method in methods if method != POLISHED or task in POLISH]
+    chosen = (
+        [("", given.config, SEEDS, False)]
+        if trial
+        else [(task, config_of(task, method), count[method], method == POLISHED) for task, method in pairs]
+    )
+    marks = tuple(given.marks), tuple(mark for mark in given.marks if mark > EXPLORED)
     wanted = [
-        Wanted(config, seed, tuple(given.marks), (*settings, *settings_of(task, kind)))
+        Wanted(config, seed, marks[polished], (*settings, *settings_of(task, kind)), polished)
         for seed in seeds_of(given.seeds or f"0:{SEEDS}")
         for kind in given.map or [""]
-        for task, config, most in chosen
-        if given.seeds or seed < most
+        for task, config, most, polished in chosen
+        if marks[polished] and (given.seeds or seed < most)
     ]
     if not wanted:
         of_maps = f"{', '.join(ELSEWHERE)} needs --map"

@@ -162,6 +162,8 @@ def test_certified_rows_replace_those_of_the_same_run_and_the_median_is_over_see
     assert "**20** (10 to 50, 3 seeds) | **2,000** (2,000 to 2,000, 2 seeds) |" in certified.in_words(table)
     wanted = [certified.Wanted(Path("ant_trap_es.yaml"), seed, (10**7, 10**8)) for seed in range(4)]
     assert [one.seed for one in certified.missing(wanted, table)] == [1, 3]
+    polished = [one._replace(polished=True) for one in wanted]
+    assert certified.missing(polished, table) == polished, "rows of a search are not those of what polishes its elites"
 
 
 def test_rows_of_a_run_without_settings_are_kept_and_known_again(tmp_path, monkeypatch):
