@@ -3,6 +3,7 @@
     python -m tests.benchmarks.goals                                     # all that is missing: hours on two cores
     python -m tests.benchmarks.goals --tasks ant_u_maze --seeds 0:1
     python -m tests.benchmarks.goals --tasks ant_u_maze --seeds 100:101 --set search.screened=64     # a trial
+    python -m tests.benchmarks.goals --one --seeds 0:5                   # one policy for all goals of a maze
     python -m tests.benchmarks.goals --table                             # only print the table
     python -m tests.benchmarks.goals --draw ant_u_maze                   # the picture, of the run folders of seed 0
 
@@ -10,6 +11,8 @@
 with which a new episode starts when that goal is drawn. Each goal and seed is a row of results/goal_archives.csv: the
 share of 256 certified episodes in which the ant comes within 0.5 m of the goal. A finished seed is not computed again;
 one that is interrupted goes on from runs/goals. Settings of a trial are told in the row.
+
+With `--one`, ARS trains one policy, which sees the goal that is drawn in each episode. Its row has the goal `drawn`.
 """
 
 from __future__ import annotations
@@ -19,16 +22,19 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from es_service import open_run
+from es_service import api, open_run
 from es_service.cli.sweep import GOALS, HELD, seeds_of
 from es_service.protocol.machine import VERSION, cores, cpu_kind
-from workers.environments.ant_tasks import MAZES, cells_of, goals_of, place, walls_of
+from es_service.runs.certification import certify_run
+from es_service.runs.goals import goals_reached
+from workers.environments.ant_tasks import DRAWN, MAZES, cells_of, goals_of, place, walls_of
 
 RUNS = Path(__file__).parents[2] / "runs" / "goals"
 RESULTS = Path(__file__).parent / "results" / "goal_archives.csv"
@@ -49,6 +55,25 @@ POLISH = (
 """Settings of the polish, from trials with seed 100."""
 
 
+ONE_STEPS = 200_000_000
+ONE: Mapping[str, Any] = {
+    "policy": {"hidden": [64], "action_noise": 0},
+    "search": {
+        "algorithm": "ars",
+        "pairs": 64,
+        "sigma": 0.025,
+        "shaping": {"count": 32},
+        "step": {"learning_rate": 0.015},
+        "learning_rate_decay": 0.9995,
+        "learning_rate_limit": 0.003,
+        "evaluation_episodes": 64,
+    },
+    "map": {"enabled": False},
+    "budget": {"env_steps": ONE_STEPS},
+}
+"""Config of one policy for all goals, without its task."""
+
+
 def command(*words: object, settings: Sequence[str]) -> None:
     """Run a command of es-service with settings to its end."""
     given = [*map(str, words), *(f"--set={setting}" for setting in settings)]
@@ -63,9 +88,22 @@ def archive(task: str, seed: int, settings: Sequence[str]) -> pd.DataFrame:
     command("run", "ant_big_maze_memes", "--or-resume", "--out", folder / "explore", settings=explore)
     polish = [*POLISH, f"budget.env_steps={GOAL_STEPS}", *settings]
     command("polish", folder / "explore", "--goals", "all", "--out", folder / "polish", settings=polish)
-    rows = pd.read_csv(folder / "polish" / GOALS).drop(columns="run")
-    return rows.assign(
-        task=task, explore_steps=EXPLORE_STEPS[task], settings=" ".join(settings), cores=cores(),
+    return told(pd.read_csv(folder / "polish" / GOALS), task, EXPLORE_STEPS[task], settings, started)
+
+
+def one_policy(task: str, seed: int, settings: Sequence[str]) -> pd.DataFrame:
+    """Row of a seed: the policy that all goals share."""
+    folder, started = RUNS / f"{task}_{seed}_one", time.time()
+    of_task = {"environment": task, "options": {"reward": "dense"}, "episodes_per_member": 4}
+    run = api.run_or_resume(api.load_config({**ONE, "task": of_task, "seed": seed}, settings), folder).run
+    certify_run(run.folder)
+    return told(goals_reached([run.folder]), task, 0, settings, started)
+
+
+def told(rows: pd.DataFrame, task: str, explore_steps: int, settings: Sequence[str], started: float) -> pd.DataFrame:
+    """Rows with what else the table says of a run."""
+    return rows.drop(columns="run").assign(
+        task=task, explore_steps=explore_steps, settings=" ".join(settings), cores=cores(),
         hours=round((time.time() - started) / 3600, 3), cpu=cpu_kind(), version=VERSION,
     )  # fmt: skip
 
@@ -74,11 +112,10 @@ def table(rows: pd.DataFrame) -> str:
     """A line for each task and seed: how many goals are reached in at least half of the episodes, and how often the
     archive reaches a goal that is drawn."""
     lines = ["| task | seed | goals reached | share of episodes | steps |", "| --- | --- | --- | --- | --- |"]
-    for _, of in rows.groupby(["task", "seed", "settings"], sort=False):
-        task, seed, settings, explored = of[["task", "seed", "settings", "explore_steps"]].iloc[0]
-        steps = of.env_steps.sum() + explored
-        title = f"{task} ({settings})" if settings else task
-        reached = f"{int((of.success >= HELD).sum())} of {len(of)}"
+    for (task, seed, settings, one), of in rows.groupby(["task", "seed", "settings", rows.goal == DRAWN], sort=False):
+        steps = of.env_steps.sum() + of.explore_steps.iloc[0]
+        title = f"{task}{', one policy' * one}{f' ({settings})' if settings else ''}"
+        reached = "" if one else f"{int((of.success >= HELD).sum())} of {len(of)}"
         lines.append(f"| {title} | {seed} | {reached} | {of.success.mean():.0%} | {steps:.2g} |")
     return "\n".join(lines)
 
@@ -113,6 +150,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(MAZES), choices=list(MAZES))
     parser.add_argument("--seeds", default="0:5")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
+    parser.add_argument("--one", action="store_true", help="one policy for all goals")
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--draw", choices=list(MAZES))
     given = parser.parse_args()
@@ -122,18 +160,19 @@ def main() -> None:
     rows = (
         pd.read_csv(RESULTS, keep_default_na=False)
         if RESULTS.exists()
-        else pd.DataFrame(columns=["task", "seed", "settings"])
+        else pd.DataFrame(columns=["task", "seed", "settings", "goal"])
     )
     settings = " ".join(given.settings)
     for task in () if given.table else given.tasks:
         for seed in seeds_of(given.seeds):
             same = (rows.task == task) & (rows.seed == seed) & (rows.settings == settings)
-            if same.any():
+            if (same & ((rows.goal == DRAWN) == given.one)).any():
                 continue
-            rows = pd.concat([rows, archive(task, seed, given.settings)], ignore_index=True)
+            computed = (one_policy if given.one else archive)(task, seed, given.settings)
+            rows = pd.concat([rows, computed], ignore_index=True)
             rows.to_csv(RESULTS, index=False)
-            if seed:
-                shutil.rmtree(RUNS / f"{task}_{seed}")
+            if seed or given.one:
+                shutil.rmtree(RUNS / f"{task}_{seed}{'_one' * given.one}")
     print(table(rows))
 
 
