@@ -104,8 +104,8 @@ class Writer:
 
     part = 300
     """Operations of a basic block of longer straight code. LLVM chooses and schedules the instructions of a block in a
-    time that grows faster than its length: an ant of MJX in parts compiles in half the time, and its code is as fast
-    with AVX2."""
+    time that grows faster than its length: an ant of MJX in parts compiles in half the time, and its code is as
+    fast."""
 
     def __init__(
         self,
