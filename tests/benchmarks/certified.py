@@ -171,7 +171,7 @@ def run_one(wanted: Wanted) -> pd.DataFrame:
         }
         if {*wanted.settings}.intersection(f"map.kind={kind}" for kind in KINDS):
             of_run |= {name: float(then[name]) for name in COUNTED}
-        rows.append(of_run | policy.row() | {"cpu": cpu_kind(), "commit": code})
+        rows.append(policy.row() | of_run | {"cpu": cpu_kind(), "commit": code})
     return pd.DataFrame(rows)
 
 
