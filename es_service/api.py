@@ -247,10 +247,11 @@ def _folder(out: str | os.PathLike[str] | None, config: RunConfig) -> Path:
 
 def default_folder(config: RunConfig, which: str = "") -> Path:
     """A new folder under `runs/`, named after task, algorithm, `which` or the seed, time and process id, so that runs
-    that start at the same time get different folders. Colons become underscores, because scp and others read HOST:PATH.
+    that start at the same time get different folders. Colons and slashes in names become underscores: scp and others
+    read HOST:PATH, and runs are found in this folder only.
     """
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
-    kind = f"{config.task.environment}_{config.search.algorithm}".replace(":", "_")
+    kind = f"{config.task.environment}_{config.search.algorithm}".translate(str.maketrans(":/", "__"))
     name = f"{kind}_{which or f'seed{config.seed}'}_{when}-{os.getpid()}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())

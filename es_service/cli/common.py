@@ -356,6 +356,8 @@ def bounds_of(words: Sequence[str]) -> dict[str, tuple[float, float]]:
         task, _, ends = word.rpartition("=")
         try:
             low, high = map(float, ends.split(","))
+            if not task or not math.isfinite(low) or not math.isfinite(high):
+                raise ValueError
             found[task] = low, high
         except ValueError:
             what = f"--bounds {word}: write TASK=LOW,HIGH, such as point_maze=-130,-25"

@@ -97,13 +97,13 @@ def run(
 ) -> None:
     """Start a run from a config file; with --seeds, a run for each seed."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
+    if or_resume and out is None:
+        raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     if seeds is not None:
         if show_output:
             raise ConfigError("--show-output and --seeds cannot be combined; `status` shows the newest lines of a run")
         run_seeds(config, seeds, out, wanted, seed, log, log_level, as_json=as_json)
         return
-    if or_resume and out is None:
-        raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
     print_config_notes(config, [loaded])

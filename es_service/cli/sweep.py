@@ -157,19 +157,26 @@ def polish_goals(
 
 def _show_goals(runs: Sequence[SweptRun], out: Path) -> None:
     """Print what the certified policy of each goal does, and write it to a file."""
+    import pandas as pd
+
     from es_service.runs.goals import goals_reached
 
     reached = goals_reached(run.folder for run in runs if run.row is not None)
     if reached.empty:
         return
+    reached.to_csv(out / GOALS, index=False)
     for row in reached.to_dict("records"):
         share, low, high = (row[name] for name in ("success", "success_low", "success_high"))
-        reaches = f"{share:.0%} of {row['episodes']} episodes succeed ({low:.0%} to {high:.0%})"
-        value = reaches if row["episodes"] else "not certified"
+        if pd.notna(share):
+            value = f"{share:.0%} of {row['episodes']} episodes succeed ({low:.0%} to {high:.0%})"
+        elif pd.notna(row["episodes"]):
+            value = f"a mean return of {row['return_mean']:.6g} in {row['episodes']} episodes"
+        else:
+            value = "not certified"
         print_line(console, f"goal {row['goal']}, seed {row['seed']}: {value}, after {row['env_steps']:,} steps")
-    held = int((reached.success >= HELD).sum())
-    print_line(console, f"{held} of {len(reached)} policies succeed in at least half of their episodes")
-    reached.to_csv(out / GOALS, index=False)
+    if reached.success.notna().any():
+        held = int((reached.success >= HELD).sum())
+        print_line(console, f"{held} of {len(reached)} policies succeed in at least half of their episodes")
     print(out / GOALS)
 
 

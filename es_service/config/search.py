@@ -218,8 +218,9 @@ class PopulationConfig(SearchConfig):
     step_gate: Switch = Field(
         False,
         description="Whether each step is shortened to the agreement of the two halves of the pairs: the learning "
-        "rate is multiplied by the cosine between their gradient estimates, or by 0 if that is negative. Gradients "
-        "then cost twice as much.",
+        "rate is multiplied by the cosine between their gradient estimates, or by 0 if that is negative. Pairs without "
+        "weight are in neither half. With `clipup`, this shortens what is added to the velocity, and its greatest "
+        "speed only if `max_speed` is null. Gradients then cost twice as much.",
     )
     shaping: Shaping = Field(
         Ranks(),

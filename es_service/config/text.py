@@ -146,10 +146,9 @@ def plain(value: Any) -> Any:
 def in_line(value: object) -> str:
     """A value as one would type it in a config, on one line."""
     try:
-        text = _dump(value, flow=True, width=1_000_000)
+        return _dump(value, flow=True, width=1_000_000).removesuffix("...\n").removesuffix("\n")
     except (YAMLError, RecursionError):  # from a Python mapping, or a list that contains itself
-        text = repr(value)
-    return " ".join(text.removesuffix("...\n").split())
+        return " ".join(repr(value).split())
 
 
 def show(value: object) -> str:

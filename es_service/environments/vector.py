@@ -84,7 +84,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         """Compile the task's step, or take it from the cache.
 
         Args:
-            task: a shipped task (point_maze, ant_maze, ant_trap), `brax:NAME`, `mujoco:ID`, or module:Class of a class
+            task: a shipped task (as `es-service list` shows), `brax:NAME`, `mujoco:ID`, or module:Class of a class
                 in JAX.
             num_envs: number of environments.
             max_episode_steps: steps after which an episode is truncated; None: the task's own number.

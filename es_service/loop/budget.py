@@ -21,6 +21,8 @@ REACHED = {
 """The column of the history that each key of the budget limits."""
 MOST_DURATIONS = 5
 """Newest generations by whose durations a run judges whether another one can end within `wall_clock_s`."""
+STARTING = {"wall_clock_s": "s", "cpu_s": "seconds of processors"}
+"""Keys of budgets of time for which starting counts, too, and the words for their unit."""
 SECONDS = ("rollout_s", "cpu_s")
 """Keys of budgets of time that end a run after the generation that reaches them."""
 PHASES = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
@@ -57,20 +59,22 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequenc
         recent: `durations` of the newest generations, at most MOST_DURATIONS.
     """
     reached = _reached(limits, row)
+    if only_started(limits, row):
+        return {
+            key: f"only starting took place: the budget of {limits[key]:g} {STARTING[key]} was spent before the first "
+            f"generation, exceeded by {row[REACHED[key]] - limits[key]:.1f} s, by starting workers, compiling and "
+            "evaluating the initial centres"
+            for key in reached
+        }
     reasons = {key: _REASONS[key](limits[key]) for key in reached if key in _REASONS}
     for key in reasons.keys() & {"env_steps", *SECONDS}:
         if over := row[REACHED[key]] - limits[key]:
             reasons[key] += f", exceeded by {over:,.1f} s" if key in SECONDS else f", exceeded by {over:,.0f}"
     if (limit := limits.get("wall_clock_s")) is not None:
         seconds, least = row["wall_clock_s"], min(recent) if len(recent) > 1 else 0.0
-        budget, over = f"the budget of {limit:g} s", f", exceeded by {seconds - limit:.1f} s"
-        if only_started(limits, row):
-            reasons["wall_clock_s"] = (
-                f"only starting took place: {budget} was spent before the first generation{over}, by starting workers, "
-                "compiling and evaluating the initial centres"
-            )
-        elif seconds >= limit:
-            reasons["wall_clock_s"] = f"{budget} is spent{over}"
+        budget = f"the budget of {limit:g} s"
+        if seconds >= limit:
+            reasons["wall_clock_s"] = f"{budget} is spent, exceeded by {seconds - limit:.1f} s"
         elif seconds + least > limit:
             reasons["wall_clock_s"] = (
                 f"{budget} has no time for another generation: {seconds:.1f} s are spent, and each of the last "
@@ -80,8 +84,10 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float], recent: Sequenc
 
 
 def only_started(limits: Mapping[str, float], row: Mapping[str, float]) -> bool:
-    """Whether a run is over by `wall_clock_s` alone before its first generation, and so is not finished."""
-    return row["generation"] < 1 and _reached(limits, row) == ["wall_clock_s"]
+    """Whether a run is over before its first generation by limits that starting counts for alone, and so is not
+    finished."""
+    reached = _reached(limits, row)
+    return row["generation"] < 1 and bool(reached) and STARTING.keys() >= {*reached}
 
 
 def _reached(limits: Mapping[str, float], row: Mapping[str, float]) -> list[str]:

@@ -19,7 +19,6 @@ from typing import Any
 
 from es_service.config.search import PopulationConfig
 from es_service.config.sections import BudgetConfig
-from es_service.errors import StoreError
 from es_service.logs import in_generation
 from es_service.loop import budget as budgets
 from es_service.loop.blocks import state_of
@@ -117,7 +116,8 @@ def run(
             for one in together:
                 found = rows(search, one, reachable)
                 taken.append(Generation(one.state.generation, one.parts, *found, one.contents))
-        except StoreError as error:  # nobody has a policy that it names; those before it are stored
+        # Nobody has a policy that it names, or a metric of the search cannot be computed; those before it are stored.
+        except Exception as error:
             wrong = error
         since = clock.meanwhile("seconds_driver", since)
         if taken:

@@ -13,6 +13,7 @@ from itertools import islice
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
 from es_service.config.sections import NoveltyConfig
@@ -191,18 +192,21 @@ def halves(
 ) -> Requests[tuple[list[FloatArray], list[float]]]:
     """As `estimate_gradients`, and how well the two halves of each population agree, from 0 to 1.
 
-    Each half's estimate is from its own pairs; the agreement is the cosine between them, or 0 if that is negative or
-    one of them is 0.
+    Each half's estimate is from its own pairs, of those whose weight is not 0; the agreement is the cosine between
+    them, or 0 if that is negative or one of them is 0.
     """
     parts = []
     for is_first in (True, False):
-        half = [
-            np.where((np.arange(weights_P.size) < weights_P.size // 2) == is_first, weights_P, np.float32(0.0))
-            for weights_P in weights
-        ]
+        half = [np.where(_is_in_first_half(weights_P) == is_first, weights_P, np.float32(0.0)) for weights_P in weights]
         parts.append((yield from estimate_gradients(generation, half, block_pairs)))
     pairs = list(zip(*parts, strict=True))
     return [first_D + second_D for first_D, second_D in pairs], [_agreement(*pair) for pair in pairs]
+
+
+def _is_in_first_half(weights_P: FloatArray) -> NDArray[np.bool_]:
+    """Whether each pair is in the first half of those whose weight is not 0."""
+    rank_P = np.cumsum(weights_P != 0.0)
+    return rank_P <= rank_P[-1] // 2
 
 
 def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:

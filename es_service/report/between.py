@@ -70,7 +70,8 @@ class Compared(NamedTuple):
     @property
     def smallest_p(self) -> float:
         """The smallest corrected p that all pairs allow, with as many runs as the groups have."""
-        return min(1.0, len(self.pairs) * min(pair.difference.smallest_p for pair in self.pairs))
+        smallest = min((pair.difference.smallest_p for pair in self.pairs), default=1.0)
+        return min(1.0, max(1, len(self.pairs)) * smallest)
 
 
 def compared(

@@ -304,8 +304,11 @@ def at(x_G: NDArray[np.float64], y_G: NDArray[np.float64], x_K: NDArray[np.float
 
 
 def common_threshold(runs: Sequence[RunData]) -> float | None:
-    """The target fitness of the runs' budgets, if they all have the same."""
-    targets = {run.meta.config["budget"].get("target_fitness") for run in runs}
+    """The target fitness of the runs' budgets, if they all have the same; a share where the fitness is one."""
+    targets = set()
+    for run in runs:
+        target, (low, high) = run.meta.config["budget"].get("target_fitness"), run.bounds_of_fitness or (0.0, 1.0)
+        targets.add(None if target is None else (target - low) / (high - low))
     return targets.pop() if len(targets) == 1 else None
 
 

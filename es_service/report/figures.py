@@ -14,7 +14,7 @@ import numpy as np
 from es_service.errors import ConfigError, StoreError, WayOut, counted
 from es_service.report import compare, plots
 from es_service.report.data import RunData
-from es_service.report.maps import over_seeds
+from es_service.report.maps import have_same_cells, over_seeds
 from es_service.report.markup import value_range
 from es_service.report.measures import CERTIFIED, chosen, has_curve, measures
 
@@ -163,6 +163,7 @@ def write_figures(
             drawings["behaviour_maps"] = lambda figure: _grid(figure, [
                 (group.name, compare.median_run(group)) for group in groups
             ], "fitness")  # fmt: skip
+        if all(have_same_cells(group.runs) for group in groups):
             drawings["behaviour_maps_median"] = lambda figure: _grid(figure, [
                 (group.name, over_seeds(group.runs, "median")) for group in groups
             ], "median fitness")  # fmt: skip

@@ -314,12 +314,9 @@ def over_seeds(runs: Sequence[RunData], over: Over) -> RunData:
 
     Raises ValueError if the runs have no maps, or maps with different cells.
     """
-    maps = [projected(run.map) for run in runs if run.map is not None]
-    first = maps[0].geometry if maps else None
-    if len(maps) < len(runs) or any(
-        map_.geometry.size != first.size or map_.geometry.bounds != first.bounds for map_ in maps if first is not None
-    ):
+    if not have_same_cells(runs):
         raise ValueError("the maps of these runs do not have the same cells")
+    maps = [projected(run.map) for run in runs if run.map is not None]
     cell_N = np.unique(np.concatenate([map_.cell_N for map_ in maps]))
     fitness_R_N = np.full((len(maps), cell_N.size), np.nan)
     for fitness_N, map_ in zip(fitness_R_N, maps, strict=True):
@@ -333,6 +330,16 @@ def over_seeds(runs: Sequence[RunData], over: Over) -> RunData:
         found = rows[np.searchsorted(map_.cell_N[rows], cell_N[there_N])]
         descriptor_N_B[there_N] = map_.descriptor_N_B[found]
     return replace(runs[0], map=_with(maps[0], cell_N, value_N, descriptor_N_B))
+
+
+def have_same_cells(runs: Sequence[RunData]) -> bool:
+    """Whether all runs have maps, and these have the same cells; those of a dominated map are those of its grid."""
+    cells = [tessellation(projected(run.map).geometry) for run in runs if run.map is not None]
+    return len(cells) == len(runs) and all(
+        (one.bounds, one.shape) == (cells[0].bounds, cells[0].shape)
+        and np.array_equal(one.middles_of(np.arange(one.size)), cells[0].middles_of(np.arange(one.size)))
+        for one in cells
+    )
 
 
 def until(data: RunData, generation: int) -> RunData:

@@ -180,7 +180,7 @@ def curves(
 ) -> None:
     """Draw a history column: of one run as a line, of several as the median of each group.
 
-    A shaded region is the interval of the median that a comparison page draws, by `bootstrap.median_interval`; a group
+    A shaded region is the interval of the median that a comparison page draws, by `statistics.median_interval`; a group
     with one seed, or with several runs of the same seed, has none.
 
     Args:

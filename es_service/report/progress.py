@@ -158,7 +158,8 @@ def _number(value: float | None) -> str:
 
 def short(value: float) -> str:
     """A count with three significant digits: 850, 12.3 k, 4.56 M."""
-    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+    value = float(f"{value:.3g}")
+    for unit, size in (("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:
             return f"{value / size:.3g} {unit}"
     return f"{value:.0f}"

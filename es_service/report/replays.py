@@ -229,7 +229,7 @@ def _solid(data: RunData, replays: Sequence[Replay], scene: Scene) -> dict[str, 
 
 def _poses(replay: Replay) -> np.ndarray:
     """[T, L, 7] poses in double precision; 0 where they are not finite."""
-    return np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64))
+    return np.nan_to_num(np.asarray(replay.recording.poses_T_L_7, np.float64), posinf=0.0, neginf=0.0)
 
 
 def goal_radius(goal: Sequence[float], start_2: np.ndarray, reach: float) -> float:

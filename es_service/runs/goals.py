@@ -91,4 +91,4 @@ def goals_reached(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
                 "run": str(folder),
             }
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).astype({"success": "Float64", "episodes": "Int64"} if rows else {})

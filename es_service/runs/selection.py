@@ -212,7 +212,7 @@ def share_interval(successes: int, count: int) -> tuple[float, float]:
     share, grown = successes / count, 1.0 + z * z / count
     middle = (share + z * z / (2.0 * count)) / grown
     half = z * math.sqrt(share * (1.0 - share) / count + z * z / (4.0 * count * count)) / grown
-    return max(0.0, middle - half), min(1.0, middle + half)
+    return (0.0 if successes == 0 else middle - half), (1.0 if successes == count else middle + half)
 
 
 def gap_interval(first: Any, second: Any, *, paired: bool) -> tuple[float, float, float]:

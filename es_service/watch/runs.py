@@ -39,7 +39,8 @@ class FoundRun(NamedTuple):
 
     key: str
     name: str
-    """Its folder as users name it: the given folder, and the way from there."""
+    """Its folder as users name it: the given folder, with its whole path if another one has the same name, and the way
+    from there."""
     folder: Path
     root: Path
 
@@ -72,12 +73,14 @@ class RunSummary(NamedTuple):
 class Runs:
     def __init__(self, roots: Sequence[Path]) -> None:
         self._roots = [root.absolute() for root in roots]
+        names = [root.name for root in dict.fromkeys(self._roots)]
+        self._titles = {root: root.name if names.count(root.name) == 1 else str(root) for root in self._roots}
         self._known: dict[str, FoundRun] = {}
         self._summaries: dict[str, tuple[Any, RunSummary]] = {}
 
     def find(self) -> list[FoundRun]:
         """The runs that there are now, in the order of their names."""
-        runs = {run.key: run for root in self._roots for run in _below(root)}
+        runs = {run.key: run for root in self._roots for run in _below(root, self._titles[root])}
         self._known |= runs
         before = self._summaries  # to which another thread may add meanwhile
         self._summaries = {key: before[key] for key in runs if key in before}
@@ -165,10 +168,10 @@ def _summary(run: FoundRun) -> RunSummary:
     return RunSummary(run, status, certified, elsewhere, "")
 
 
-def _below(root: Path) -> Iterator[FoundRun]:
+def _below(root: Path, title: str) -> Iterator[FoundRun]:
     for folder in _run_folders(root, DEEPEST):
         key = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
-        name = root.name if folder == root else str(Path(root.name) / folder.relative_to(root))
+        name = title if folder == root else str(Path(title) / folder.relative_to(root))
         # A name may be no UTF-8; then it is shown with question marks.
         yield FoundRun(key, os.fsencode(name).decode(errors="replace"), folder, root)
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import json
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,6 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import (
     HTMLResponse,
-    JSONResponse,
     PlainTextResponse,
     RedirectResponse,
     Response,
@@ -217,7 +217,7 @@ class Site:
     async def _cell(self, request: Request) -> Response:
         """The path of an elite, and the call that evaluates it."""
         run, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
-        return JSONResponse(await _answer(_READING, lambda: self._details(run, cell)))
+        return _json(await _answer(_READING, lambda: self._details(run, cell)))
 
     def _details(self, run: FoundRun, cell: int) -> dict[str, Any]:
         data = self._data(run)
@@ -236,7 +236,7 @@ class Site:
         async with self._recording:
             if await request.is_disconnected():  # the viewer has chosen another cell meanwhile
                 return Response(status_code=409)
-            return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(run, which)))
+            return _json(await _answer(_RECORDING, lambda: self._recorded(run, which)))
 
     def _recorded(self, run: FoundRun, which: str) -> dict[str, Any]:
         """The section of a replay, of "best", "certified" or the elite of a cell, and what its script needs."""
@@ -274,6 +274,11 @@ def _generation(data: RunData, cell: int) -> int:
     return int(data.map.generation_N[data.map.row_of(cell)])
 
 
+def _json(value: Mapping[str, Any]) -> Response:
+    """In ASCII, since the path of a run may be no UTF-8."""
+    return Response(json.dumps(value, allow_nan=False), media_type="application/json")
+
+
 async def _in(threads: ThreadPoolExecutor, work: Callable[[], T]) -> T:
     return await asyncio.get_running_loop().run_in_executor(threads, work)
 
@@ -282,7 +287,7 @@ async def _answer(threads: ThreadPoolExecutor, work: Callable[[], T]) -> T:
     try:
         return await _in(threads, work)
     except ServiceError as error:
-        raise HTTPException(409, error.sentence) from error
+        raise HTTPException(409, error.sentence.encode(errors="replace").decode()) from error
 
 
 def serve(

@@ -120,6 +120,11 @@ def test_a_run_with_time_for_nothing_but_its_start_has_only_started():
         "by 35.7 s, by starting workers, compiling and evaluating the initial centres"
     }
     assert only_started(limits, late)
+    both, late_by_both = {"cpu_s": 9.0, **limits}, {**late, "cpu_s": 60.0}
+    assert only_started(both, late_by_both)
+    assert only_started({"cpu_s": 9.0}, late_by_both)
+    assert "budget of 9 seconds of processors was spent before the first" in spent(both, late_by_both)["cpu_s"]
+    assert spent({"cpu_s": 9.0, "wall_clock_s": 500.0}, late_by_both).keys() == {"cpu_s"}
     assert not only_started(limits, row(generation=1, seconds=40.7))
     assert not only_started({"generations": 0, **limits}, late)
     assert not only_started({"wall_clock_s": 50.0}, late)

@@ -60,7 +60,7 @@ def test_a_long_value_is_whole_in_a_command():
 
 def test_overrides_by_key_are_those_in_text():
     values = {"search.sigma": 1e-7, "policy.hidden": [64, 64], "budget.env_steps": None, "task.options.start": "off",
-              "search.init_from": "a: b"}  # fmt: skip
+              "search.init_from": "two  spaces/a: b\u2028"}  # fmt: skip
     assert parse_overrides(values) == (values, [])
     found, (problem,) = parse_overrides(["search.sigma"])
     assert (found, problem.sentence) == ({}, "override search.sigma: write KEY=VALUE, such as search.sigma=0.05")

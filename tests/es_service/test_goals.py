@@ -108,6 +108,17 @@ def test_policies_of_all_goals_reach_them_and_the_command_goes_on(parent, tmp_pa
     pd.testing.assert_frame_equal(goals_reached(table.run), table, check_dtype=False)  # finished runs are not repeated
 
 
+def test_a_goal_that_is_not_certified_is_said_to_be_so(parent, tmp_path):
+    words = ["polish", parent.folder, "--goals", "all", "--out", tmp_path / "out", "--workers", 1]
+    for setting in ("search.pairs=4", "search.screened=2", "search.candidates=1", "budget.wall_clock_s=0.001"):
+        words += ["--set", setting]
+    result = CliRunner().invoke(app, [*map(str, words)])
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert "goal left, seed 0: not certified" in result.output
+    assert "is not finished" in result.output
+    assert pd.read_csv(tmp_path / "out/goals.csv").success.isna().all()
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -6,7 +6,7 @@ from collections import deque
 import pytest
 from rich.console import Console
 
-from es_service.report.progress import live_table, plain_line, show_progress
+from es_service.report.progress import live_table, plain_line, short, show_progress
 
 ROW = {
     "generation": 123456,
@@ -76,3 +76,8 @@ def test_the_spread_of_one_episode_is_not_shown(std, shown):
         console.print(live_table("runs/a", deque([ROW | {"centre_fitness_std": std}]), 80, 24))
     assert shown in capture.get()
     assert ("±" in capture.get()) == bool(std)
+
+
+def test_counts_have_three_digits_at_the_borders_of_units_too():
+    counts = {999.4: "999", 999.7: "1 k", 12_345: "12.3 k", 999_499: "999 k", 999_500: "1 M", 1.2345e12: "1.23 T"}
+    assert {count: short(count) for count in counts} == counts

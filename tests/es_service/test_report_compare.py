@@ -253,6 +253,8 @@ def test_a_common_target_is_the_threshold(tmp_path):
         read_run(write_run(tmp_path / str(seed), {"seed": seed, "budget.target_fitness": -90.0})) for seed in range(2)
     ]
     assert "2 of 2 runs reach -90.00" in comparison_page(runs)
+    assert compare.common_threshold(runs) == -90.0
+    assert compare.common_threshold(compare.normalised(runs, {"point_maze": (-130.0, -50.0)})) == 0.5
 
 
 def test_a_run_without_generations_is_refused(runs, tmp_path):
@@ -317,6 +319,12 @@ def test_maps_over_seeds_have_the_share_of_the_runs_and_the_median_fitness(runs,
     assert set(both.fitness_N) == {0.5, 1.0}
     with pytest.raises(ValueError, match="do not have the same cells"):
         several_maps.over_seeds([runs[0], replace(runs[1], map=None)], "share")
+    other = read_run(write_run(tmp_path / "other", {"map.cells": [40, 10]}))  # as many, and others
+    assert map_of(other).geometry.size == maps[0].geometry.size
+    assert not several_maps.have_same_cells([runs[0], other])
+    written = write_figures([runs[0], other], tmp_path / "figures", keys=["search.algorithm"])
+    assert "behaviour_maps" in {file.stem for file in written}
+    assert not {"behaviour_maps_median", "behaviour_maps_filled"} & {file.stem for file in written}
 
 
 def test_a_map_until_a_generation_has_the_fittest_of_each_cell(runs):

@@ -208,6 +208,8 @@ def test_a_page_says_what_so_few_runs_can_show(runs):
     assert "Runs count as independent" in said
     assert "Wilcoxon" in words(comparison_page(runs, paired=True))
     assert "Between groups" not in words(comparison_page(runs[:4]))
+    alone = between.compared(compare.grouped(runs[:4]))
+    assert all((one.pairs, one.smallest_p, len(one.averages)) == ((), 1.0, 1) for one in alone)
 
 
 def certified(run, *values, fitness="sum"):
@@ -289,6 +291,9 @@ def test_runs_of_several_tasks_are_compared_by_shares_of_the_way_between_bounds(
         compare.normalised(both, {"point_maze": (0.0, 1.0)})
     with pytest.raises(ConfigError, match="write TASK=LOW,HIGH"):
         bounds_of(["point_maze=1"])
+    for word in ("point_maze=1,nan", "point_maze=inf,2", "=1,2"):
+        with pytest.raises(ConfigError, match="write TASK=LOW,HIGH"):
+            bounds_of([word])
     assert bounds_of(["brax:ant=-1,2e3"]) == {"brax:ant": (-1.0, 2000.0)}
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import re
 import shutil
 import socket
@@ -351,6 +352,27 @@ def test_metrics_are_the_newest_numbers(tmp_path):
         assert f"es_service_{name}{labels} {float(newest[name])!r}\n" in text
     for name, value in (("generation", 30), ("running", 0), ("readable", 1), ("lost_workers", 1), ("retries", 2)):
         assert f"es_service_{name}{labels} {float(value)!r}\n" in text
+
+
+def test_runs_below_folders_of_the_same_name_have_different_names(tmp_path):
+    roots = [tmp_path / "x/runs", tmp_path / "y/runs"]
+    for root in roots:
+        write_run(root / "a")
+    assert [run.name for run in Runs(roots).find()] == [str(root / "a") for root in roots]
+    assert [run.name for run in Runs([roots[0], roots[0]]).find()] == ["runs/a"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are text there")
+def test_a_run_whose_path_is_no_utf8_is_shown(tmp_path):
+    folder = tmp_path / os.fsdecode(b"b\xff")
+    write_run(folder)
+    app = site(tmp_path).app(None)
+    [found] = Runs([tmp_path]).find()
+    cell = int(read_run(folder).map.cell_N[0])
+    assert get(app, f"/run/{found.key}/cell/{cell}")[0] == 200
+    status, _, text = get(app, f"/run/{found.key}/replay/certified", method="POST")
+    assert status == 409
+    assert "has no certified policy" in text
 
 
 def test_the_certified_fitness_is_in_the_unit_of_the_fitness_beside_it(tmp_path, workers_here):

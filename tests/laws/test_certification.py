@@ -417,5 +417,6 @@ def test_intervals_are_those_of_the_tables():
     assert np.isnan(mean_interval([5.0])[1:]).all()
     z2 = 1.959964**2
     assert share_interval(0, 256) == pytest.approx((0.0, z2 / (256 + z2)))
+    assert (share_interval(0, 100)[0], share_interval(256, 256)[1]) == (0.0, 1.0)  # not nearly
     assert share_interval(256, 256) == pytest.approx((256 / (256 + z2), 1.0))
     assert share_interval(5, 10) == pytest.approx((0.236593, 0.763407), abs=1e-6)

@@ -187,8 +187,9 @@ def test_the_halves_of_a_population_add_up_and_agree_as_the_cosine_between_them(
     evaluator, ones = Noise(noise_P_D), np.ones(4, np.float32)
     for weights, agreement in (
         (ones, 1 / np.sqrt(5)),  # [2, 0] and [1, 2]
-        (ones * [1, 1, 0, 0], 0.0),  # the second half is 0
-        (ones * [1, 1, 0, -1], 0.0),  # they point away from each other
+        (ones * [1, 1, 0, 0], 1.0),  # pairs without weight are in neither half: [1, 0] and [1, 0]
+        (ones * [0, 1, 0, 0], 0.0),  # one half is 0
+        (ones * [1, 0, 0, -1], 0.0),  # they point away from each other
         (ones * [1, 0, 0, 0] + ones * [0, 0, -1, 1], 1.0),  # [1, 0] and [1, 0]
     ):
         [gradient_D], [found] = completed(halves(1, [np.asarray(weights, np.float32)], 2), evaluator.evaluate)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -16,6 +18,7 @@ from es_service.runs.lineage import certified_for, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
+from es_service.search.algorithms.polish import mean_ranks
 from tests.laws.test_objectives import results_of
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -111,6 +114,20 @@ def test_candidates_leave_by_mean_ranks_after_the_first_evaluation_and_after_eac
     for generation in range(9, 20):
         state = method.tell(state, evaluations(generation, {2: [-7]}))
     assert left(state, 20) == [2]
+
+
+def test_invalid_episodes_rank_last_by_every_objective(parent):
+    nan, inf = np.nan, np.inf
+
+    def ranks(objective, *candidates):
+        results = [
+            replace(results_of([fitness], np.array([[x, 0.0]])), goal_distance=np.full((1, 3), distance, np.float32))
+            for fitness, x, distance in candidates
+        ]
+        return mean_ranks(results, config_of(parent, objective={"kind": objective}).search)
+
+    assert list(ranks("fitness", (1.0, 0.0, 5.0), (9.0, nan, 1.0))) == [0.5, -0.5]
+    assert list(ranks("goal_distance", (1.0, 0.0, 5.0), (-inf, 0.0, 1.0))) == [0.5, -0.5]
 
 
 def test_fewer_elites_than_screened_are_all_taken(parent, tmp_path):

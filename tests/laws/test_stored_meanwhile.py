@@ -91,6 +91,21 @@ def test_a_generation_is_stored_after_the_next_was_sent_and_before_its_results_a
                 np.testing.assert_array_equal(array, others[name][key])
 
 
+@pytest.mark.parametrize("interval_s", [0.0, 100.0])
+def test_what_a_metric_raises_loses_no_generation_before_it(monkeypatch, interval_s):
+    def failing(search, one, reachable):
+        if one.state.generation == 3:
+            raise ZeroDivisionError("a user's metric")
+        return rows(search, one, reachable)
+
+    rows, notes = driver.rows, []
+    monkeypatch.setattr(driver, "rows", failing)
+    store, compute = run(Beginning(notes), notes, interval_s=interval_s)
+    with pytest.raises(ZeroDivisionError):
+        compute()
+    assert store.rows[-1]["generation"] == 2
+
+
 def test_a_list_of_results_drives_a_generation():
     search, work_of, results_of = search_of(), [], []
 

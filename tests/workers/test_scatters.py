@@ -75,6 +75,17 @@ def test_other_scatters_stay_and_drop_what_they_should(change):
     np.testing.assert_array_equal(jax.vmap(dense)(rows), jax.vmap(changed)(rows))
 
 
+def test_sums_clip_indices_and_keep_narrow_dtypes_as_jax_does():
+    ids = np.array([9, 1])
+    for function in (
+        lambda x: x.at[ids].add(jnp.ones(2), mode="clip"),
+        lambda x: x.astype(jnp.int8).at[ids].add(jnp.int8(100)).at[ids].add(jnp.int8(100)),
+    ):
+        found, wanted = without_scatters(function)(jnp.arange(4.0)), function(jnp.arange(4.0))
+        assert found.dtype == wanted.dtype
+        np.testing.assert_array_equal(found, wanted)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("task", ["ant_maze", "brax:halfcheetah"])
 def test_a_step_of_physics_has_none_and_is_the_same(task):

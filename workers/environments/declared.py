@@ -335,6 +335,8 @@ def describe_descriptor(
     """
     task = with_descriptor(task, choice)
     if isinstance(choice, tuple):
+        if len(set(choice)) < len(choice):
+            raise TaskError(f"task.descriptor = {list(choice)} is not allowed; name each place in the observation once")
         names = tuple(f"observation_{index}" for index in choice)
         return names, tuple(finite_bounds(*bounds_O[index]) for index in choice)
     try:

@@ -250,11 +250,11 @@ def _descriptor(suite: Suite, given: Any) -> tuple[Described, Callable[[_SuiteSt
             found.append(((f"observation_{part}",), (bounds,)))
         elif isinstance(part, str) and part in measured:
             found.append(suite.described.get(part) or dimensions(suite.name, re.sub(r"\W", "_", part), measured[part]))
-    if not parts or len(found) != len(parts):
+    if not parts or len(found) != len(parts) or len({*parts}) < len(parts):
         names = f", names of measures ({', '.join(measured)})" if measured else ""
         raise TaskError(
-            f"task.options.descriptor = {given!r} is not allowed; must be a list of places in an observation, "
-            f"0 to {size - 1}{names}, or module:function"
+            f"task.options.descriptor = {given!r} is not allowed; must be a list of different places in an "
+            f"observation, 0 to {size - 1}{names}, or module:function"
         )
 
     def described(state: _SuiteState) -> Any:

@@ -195,7 +195,7 @@ def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
 def _outputs(equation: Any, inputs: list[Any]) -> Sequence[Any]:
     """Outputs of an equation; the jaxprs in it are evaluated in the same way."""
     name, params = equation.primitive.name, equation.params
-    if name == "scatter-add" and _adds_rows(params["dimension_numbers"], *(atom.aval for atom in equation.invars)):
+    if name == "scatter-add" and _adds_rows(params, *(atom.aval for atom in equation.invars)):
         return [_sum_of_rows(*inputs)]
     if name in CALLS:
         inner = params.get("jaxpr", params.get("call_jaxpr"))
@@ -219,10 +219,13 @@ def _without(value: Any) -> Any:
     return jax.make_jaxpr(lambda *inputs: _evaluated(value, inputs))(*like)
 
 
-def _adds_rows(numbers: Any, operand: Any, indices: Any, updates: Any) -> bool:
-    """Whether a scatter adds rows [K, ...] to the rows [N, ...] that K numbers name."""
+def _adds_rows(params: dict[str, Any], operand: Any, indices: Any, updates: Any) -> bool:
+    """Whether a scatter adds rows [K, ...] to the rows [N, ...] that K numbers name, and drops those of other
+    numbers."""
+    numbers = params["dimension_numbers"]
     return (
-        indices.ndim == 2
+        params["mode"] != GatherScatterMode.CLIP
+        and indices.ndim == 2
         and indices.shape[-1] == 1
         and tuple(numbers.inserted_window_dims) == (0,)
         and tuple(numbers.scatter_dims_to_operand_dims) == (0,)
@@ -235,7 +238,7 @@ def _adds_rows(numbers: Any, operand: Any, indices: Any, updates: Any) -> bool:
 def _sum_of_rows(operand: Any, indices: Any, updates: Any) -> Any:
     is_row_N_K = indices[None, :, 0] == jnp.arange(operand.shape[0], dtype=indices.dtype)[:, None]
     is_row = is_row_N_K.reshape(*is_row_N_K.shape, *[1] * (operand.ndim - 1))
-    return operand + jnp.where(is_row, updates[None], jnp.zeros((), updates.dtype)).sum(axis=1)
+    return operand + jnp.where(is_row, updates[None], jnp.zeros((), updates.dtype)).sum(1, updates.dtype)
 
 
 def _drops(params: dict[str, Any]) -> bool:

@@ -5,6 +5,10 @@ and, with its new sample, put back where all of its samples say, so that luck fa
 policy whose new sample is invalid leaves. A sample is the mean of `search.evaluation_episodes` episodes; the resets of
 the samples of a policy are all different.
 
+Of Extract-ME's released code, two details differ: it measures at most 2,048 policies again, which is less than a
+quarter of the batch from 8,192 on; and its linear weights count from the depth, not from the deepest rank that there
+is.
+
 The kept policies are part of the search's own state: their values and names and, where the estimate is the median,
 their newest samples. If the map was emptied, as by a fork whose fitness means something else, nothing is kept.
 

@@ -95,7 +95,9 @@ def mean_ranks(results: list[EpisodesResult], search: CandidatesConfig) -> NDArr
 
     Args:
         results: results of each candidate's evaluation [E].
-        search: its objective; of novelty and of a mixture, fitness counts.
+        search: its objective; of novelty and of a mixture, fitness counts. Invalid episodes rank last.
     """
     together = each(lambda *arrays: np.stack(arrays), *results)
+    is_valid = np.isfinite(together.fitness) & np.isfinite(together.descriptor).all(axis=-1)
+    together = replace(together, fitness=np.where(is_valid, together.fitness, np.float32(np.nan)))
     return centred_ranks(values(search.objective, together)).mean(axis=1)

@@ -195,6 +195,7 @@ def moves(draw: Draw) -> Case:
         y = jnp.transpose(x, order)
         return (
             y.reshape(-1), jnp.flip(x, 0), jnp.concatenate([x, x], 0), jnp.stack([x, x], 0), jnp.tile(x, 2),
+            x.ravel(order="F"), lax.reshape(x, (x.size,), order),
             jnp.unstack(x, axis=0)[-1], *jnp.split(jnp.tile(x, 3), [of[-1], 2 * of[-1] + 1], -1),
             jnp.squeeze(x[None], 0), jnp.broadcast_to(x[None], (2, *of)), jnp.copy(x), jax.device_put(x),
             x + lax.broadcasted_iota(jnp.float32, of, len(of) - 1), lax.expand_dims(x, (0,)),

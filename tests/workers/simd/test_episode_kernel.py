@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 from es_service.protocol.noise import KEY_WORDS, Domain, stream_keys
 from tests.helpers import SPEC, random_parameters
 from workers.environments import make_environment
+from workers.simd.backend.target import host_target
 from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.episodes.program import write_episodes
 from workers.simd.episodes.rollout import make_gradient_sum
 
 LANES = 6
@@ -35,6 +38,18 @@ def test_arrays_of_other_sizes_are_refused(training: bool) -> None:
     for sizes in wrong:
         with pytest.raises(ValueError, match="must not be called with these arrays"):
             run(*sizes)
+
+
+def test_code_that_keeps_other_outputs_of_steps_has_another_name() -> None:
+    """`reward` is kept in every step and `last_reward` at the end; both are the same function."""
+
+    def name(*outputs: str) -> str:
+        spec = replace(SPEC, outputs=outputs)
+        return write_episodes(
+            make_environment("point_maze", {}), spec, np.arange(2), host_target(), training=False
+        ).name
+
+    assert name("reward") != name("last_reward")
 
 
 def test_only_the_episodes_that_are_wanted_are_run() -> None:

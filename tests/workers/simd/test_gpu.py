@@ -28,7 +28,7 @@ PAIRS = 5
     [
         {},
         {"policy": replace(POLICY, bias=False, activation="relu", output="linear")},
-        {"policy": PolicySpec(widths=(2, 2))},
+        {"policy": PolicySpec(widths=(2, 2)), "outputs": ("success",)},
         {"policy": replace(POLICY, widths=(2, 16, 2))},
         {"policy": replace(POLICY, output="gaussian"), "action_noise": 0.1, "episodes_per_member": 2},
         pytest.param(

@@ -89,6 +89,7 @@ def test_every_primitive_has_a_case() -> None:
             r"scatter-add with indices that depend on the state, among 900 places \(at most 512\)",
         ),
         (lambda x: jnp.sort(jnp.tile(x, 300)), r"sort of 900 numbers, by 20,958 comparisons \(at most 20,000\)"),
+        (lambda x: x.at[1].apply(jnp.sin), r"a function of single places, as by x.at\[i\].apply\(f\)"),
         (lambda x: x.astype(jnp.float16).astype(jnp.float32), "values of type float16"),
         (lambda x: jax.random.uniform(jax.random.key(0, impl="rbg"), x.shape), "values of type key<rbg>"),
         (

@@ -98,13 +98,14 @@ def write_episodes(
     def graphs() -> tuple[Traced, Traced]:
         return trace_jaxpr(normalised_observation), trace_jaxpr(advance, lanes_word=alive_word)
 
+    kept = [word for place in of_steps.values() for word in place]
+
     def text() -> str:
-        kept = [word for place in of_steps.values() for word in place]
         return _module(*graphs(), network, low_rank, len(inputs_O), words, alive_word, weights, kept)
 
     digests = f"{definition()} {jaxpr_digest(normalised_observation)} {jaxpr_digest(advance)}"
     kind = f"{training}{' own' * per_lane_weights}{f' rank {rank}' if rank else ''}"
-    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {kind}"
+    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {kind} {kept}"
     return EpisodeProgram(steps, carry, alive_word, network, low_rank, of_steps, name, text, graphs)
 
 

@@ -31,6 +31,8 @@ def _broadcast_in_dim(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 @primitive("reshape", "squeeze")
 def _reshape(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    if equation.primitive.name == "reshape" and equation.params["dimensions"] is not None:  # in Fortran's order, say
+        x = np.transpose(x, equation.params["dimensions"])
     return x.reshape(equation.outvars[0].aval.shape)
 
 
@@ -323,6 +325,9 @@ def _combination(t: Tracer, equation: Any) -> Combine:
     """How a scatter combines a word with an update."""
     how, dtype = equation.primitive.name.removeprefix("scatter").removeprefix("-"), dtype_in(equation)
     if not how:
+        update = equation.params["update_jaxpr"]
+        if update is not None and update.outvars[0] is not update.invars[1]:
+            raise UnsupportedError("a function of single places, as by x.at[i].apply(f)")
         return lambda old, new: new
     if how in ("min", "max"):
         return extreme_of(t.graph, how, dtype)
