@@ -193,7 +193,7 @@ def require_same(found: np.ndarray, wanted: np.ndarray, what: str, where: str = 
         what: what the arrays are, for the message.
         where: what the code is for.
     """
-    whole = (x if x.dtype.itemsize == 4 else x.astype(np.uint32) for x in (found, wanted))
+    whole = (x.astype(np.uint32) if x.dtype.itemsize < 4 else x for x in (found, wanted))
     found, wanted = (np.ascontiguousarray(x).view(np.uint32) for x in whole)
     nan = np.isnan(found.view(np.float32)) & np.isnan(wanted.view(np.float32))
     differing = np.count_nonzero((found != wanted) & ~nan)
