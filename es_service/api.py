@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
@@ -218,6 +219,7 @@ def fork(
             would have no effect. StoreError: the generation is not kept. Otherwise as `run`.
     """
     overrides, asked = _with_values(overrides)
+    generation = None if generation is None else int(generation)  # of NumPy, from a table
     again = WayOut("fork", "", os.fspath(parent), asked, generation=generation, out=_text(out))
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
@@ -241,6 +243,11 @@ def _text(path: str | os.PathLike[str] | None) -> str | None:
     return None if path is None else os.fspath(path)
 
 
+_NAMED: set[Path] = set()
+"""Folders that this process has named for runs that may not have begun yet; threads may name one at the same time."""
+_NAMING = threading.Lock()
+
+
 def _folder(out: str | os.PathLike[str] | None, config: RunConfig) -> Path:
     return default_folder(config) if out is None else given_path(out)
 
@@ -253,5 +260,8 @@ def default_folder(config: RunConfig, which: str = "") -> Path:
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
     kind = f"{config.task.environment}_{config.search.algorithm}".translate(str.maketrans(":/", "__"))
     name = f"{kind}_{which or f'seed{config.seed}'}_{when}-{os.getpid()}"
-    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
-    return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
+    folders = (RUNS_FOLDER / (name if number == 1 else f"{name}-{number}") for number in count(1))
+    with _NAMING:
+        folder = next(folder for folder in folders if folder not in _NAMED and not folder.exists())
+        _NAMED.add(folder)
+    return folder

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -89,6 +90,16 @@ class Asked:
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what `act` makes of the arrays, which would have another layout, and so other last bits."""
+        return {name: value for name, value in vars(self).items() if name != "_policies"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        vars(self).update(state)
+
     def __repr__(self) -> str:
         return f"<{len(self)} episodes: {self.token}, {self.parameters.shape[1]:,} parameters each>"
 
@@ -98,8 +109,13 @@ class Asked:
         Args:
             observation: [N, O], neither normalised nor clipped.
             step: number of the step in its episode, from 0; call it for each step in turn, so that a memory goes on.
+
+        Raises ConfigError for observations of another shape.
         """
         seen_N_O = np.asarray(observation, np.float32)
+        if seen_N_O.shape != self.observation_mean.shape:
+            what = f"observations must have the shape {list(self.observation_mean.shape)}; got {list(seen_N_O.shape)}"
+            raise ConfigError(what, field="observation", value=list(seen_N_O.shape))
         quiet, noisy = self._policies
         actions = quiet(seen_N_O, step) if quiet is not None else None
         if noisy is None:

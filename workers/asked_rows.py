@@ -76,7 +76,7 @@ def rows_of(spec: WorkerSpec, work: Sequence[Work]) -> Rows:
         else:
             policies, mean_L, std_L, policy_L, keys_L = arguments
             parts.append(_quiet(explicit(policies)[policy_L], mean_L, std_L, keys_L))
-    return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Rows(*(np.ascontiguousarray(np.concatenate(columns)) for columns in zip(*parts, strict=True)))
 
 
 def results_of(spec: WorkerSpec, work: Sequence[Work], told: EpisodesResult) -> list[ChunkResult]:

@@ -114,6 +114,7 @@ def certify_run(
     """
     for name, value, least in (("episodes", episodes, 2), ("keep", keep, 1), ("top", top or 0, 0)):
         whole(name, value, least)
+    generation = None if generation is None else int(generation)  # of NumPy, from a table
     run = open_run(folder)
     with opened(run, workers, on_notice) as (store, config):
         _measure(config, by)  # refused before workers start if wrong

@@ -198,7 +198,7 @@ def work(
             if engine is not None and (lost := row["lost_workers"]):
                 who = "a worker" if lost == 1 else counted(lost, "worker")
                 tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
-            answer = on_generation(row)
+            answer = on_generation(dict(row))
             given = answer.metrics if isinstance(answer, Stop) else answer
             if isinstance(given, Mapping) and given:
                 kept.record(row["generation"], checked_metrics(given, store.meta, "on_generation"))

@@ -173,7 +173,7 @@ class Policy(content.Policy):
                 f"this policy takes observations of shape [..., {size}]; got shape {list(observation.shape)}"
             )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
-        before = initial_memory(np, self.spec, *x.shape[:-1]) if memory is None else memory
+        before = initial_memory(np, self.spec, *x.shape[:-1]) if memory is None else np.asarray(memory, np.float32)
         outputs, after = act(np, self.spec, self.layers, before, x, dense_of_each)
         return action(np, self.spec.output, outputs), after
 

@@ -108,13 +108,13 @@ class Run:
 
     def history_until(self, generation: int | None) -> pd.DataFrame:
         """`history` up to a generation, that one included."""
-        count = None if generation is None else generation + 1
+        count = None if generation is None else int(generation) + 1
         return _frame(reader.read_history_columns(self.folder, count)).set_index("generation")
 
     def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
         """History as dictionaries, oldest first; only from `since_generation` on if given. Use `history` for a whole
         long history, which takes a tenth of the memory."""
-        return reader.read_history(self.folder, since_generation)
+        return reader.read_history(self.folder, None if since_generation is None else int(since_generation))
 
     @property
     def evaluations(self) -> pd.DataFrame:
@@ -125,7 +125,7 @@ class Run:
 
     def evaluations_until(self, generation: int | None) -> pd.DataFrame:
         """`evaluations` up to a generation, that one included."""
-        count = None if generation is None else generation + 1
+        count = None if generation is None else int(generation) + 1
         return _frame(reader.read_evaluation_columns(self.folder, count))
 
     def at(

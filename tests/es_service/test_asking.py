@@ -97,6 +97,42 @@ def test_policies_act_as_in_the_service_s_own_episodes(policy, tmp_path):
         assert ours.history[column].equals(theirs.history[column]), column
 
 
+def test_what_is_asked_acts_the_same_after_a_pickle_and_only_on_observations_of_all_rows(tmp_path):
+    sizes = {"observation_size": 8, "action_size": 2}
+    config = config_of(task={"environment": "caller", "options": sizes}, policy={"hidden": [64, 64]})
+    with ask_tell(config, tmp_path / "run") as search:
+        asked = search.ask()
+        assert asked is not None
+        seen = np.random.default_rng(0).normal(size=(20, len(asked), 8))
+        expected = [asked.act(one, 0) for one in seen]
+        copy = pickle.loads(pickle.dumps(asked))
+        np.testing.assert_array_equal([copy.act(one, 0) for one in seen], expected)
+        assert not copy.parameters.flags.writeable
+        for shape in ((8,), (1, 8), (len(asked), 1)):
+            with pytest.raises(ConfigError, match="observations must have the shape"):
+                asked.act(np.zeros(shape), 0)
+
+
+def test_a_generation_may_be_a_number_of_numpy(tmp_path, workers_here):
+    run = finished(config_of(), tmp_path / "run")
+    newest = run.map.generation.max()
+    assert isinstance(newest, np.int64)
+    assert [row["generation"] for row in run.history_rows(np.int64(5))] == [5, 6]
+    assert len(run.history_until(np.int64(2))) == 3
+    assert run.evaluations_until(np.int64(2)).generation.max() == 2
+
+
+def test_what_a_function_does_with_its_row_changes_no_run(tmp_path, workers_here):
+    def clears(row):
+        number = float(row["generation"])
+        row.clear()
+        return {"number": number}
+
+    config = config_of("es", task={"environment": "function:tests.es_service.test_asking:bowl"})
+    run = api.run(config, tmp_path / "run", on_generation=clears).run
+    assert run.history.metric_number.tolist() == [*map(float, range(7))]
+
+
 def test_left_anywhere_it_asks_the_same_again_and_ends_with_the_same_bits(tmp_path):
     whole, folder, seen = finished(config_of(), tmp_path / "whole"), tmp_path / "left", {}
     for leave_after in (0, 1, 2, 3, 2, 1, 4, 99):

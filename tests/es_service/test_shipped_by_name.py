@@ -51,6 +51,7 @@ def test_a_run_s_own_folder_has_no_colon_in_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = default_folder(load_config("brax_ant_es")).as_posix()
     assert name.startswith("runs/brax_ant_es_seed0_"), "scp and `docker compose cp` would take it for HOST:PATH"
+    assert default_folder(load_config("brax_ant_es")) != default_folder(load_config("brax_ant_es")), "of two threads"
     pole = {"task": {"environment": "gymnasium:phys2d/CartPole-v1"}, "search": {"algorithm": "es"},
             "budget": {"generations": 1}}  # fmt: skip
     assert default_folder(load_config(pole)).parent.as_posix() == "runs"

@@ -314,6 +314,7 @@ def test_a_policy_is_refused_and_a_resolved_config_is_not(tmp_path):
         ("parameters", {}, "parameters = {} is not a mapping from names to bounds"),
         ("start", {"depth": 1.0}, "start has depth, which is none of the parameters"),
         ("start", [1.0, 2.0], "start = .* has not one value for each of the 3 parameters"),
+        ("start", {"height": "high"}, "start = .* has values that are no numbers"),
         ("start", {"height": 2.0}, "start of height = 2 is not between its bounds 0 and 1"),
         ("descriptor_bounds", ((0.0, 1.0),), "are not tuples of one length"),
         ("descriptor_names", ("fitness", "high"), "'fitness' would be the column"),

@@ -216,7 +216,10 @@ def _parameters(function: Any) -> tuple[ParameterSpec | None, list[str]]:
         start = dict(zip(given, values, strict=True))
     if unknown := [name for name in start if name not in given]:
         return None, [f"start has {', '.join(map(str, unknown))}, which is none of the parameters"]
-    begun = tuple(float(value) for value in {**middle, **start}.values())
+    try:
+        begun = tuple(float(value) for value in {**middle, **start}.values())
+    except (TypeError, ValueError, OverflowError):
+        return None, [f"start = {start!r} has values that are no numbers"]
     for name, value, (low, high) in zip(given, begun, bounds, strict=True):
         if not (math.isfinite(value) and low <= value <= high):
             wrong.append(f"start of {name} = {value:g} is not between its bounds {low:g} and {high:g}")
