@@ -130,7 +130,7 @@ if __name__ == "__main__":
     actor.build()
     centre = centre_of(given)
     actor.run(pickle.dumps(({}, {}, pickle.dumps([(centre, TrainingChunk(1, chunk)) for chunk in range(6)]))))
-    time.sleep(0.1)
+    time.sleep(1.0)
     os.write(1, b"the last line\\n")
     os.kill(os.getpid(), 9)
 """
