@@ -143,12 +143,12 @@ def config_at(wanted: Wanted, mark: int) -> RunConfig:
 
 def explored_by(wanted: Wanted) -> Path:
     """Folder of the run whose elites are polished."""
-    return RUNS / f"{wanted.name}_explored"
+    return RUNS / wanted.name / "explored"
 
 
 def run_one(wanted: Wanted) -> pd.DataFrame:
     """One run from its config, or from where it was interrupted: a row for each mark."""
-    code, folder = commit(), RUNS / wanted.name
+    code, folder = commit(), RUNS / wanted.name / ("polished" if wanted.polished else "")
     in_c = IN_C.get(api.load_config(wanted.config).task.environment) if EULER in wanted.settings else None
     with workers_in_this_process():
         for number, mark in enumerate(wanted.marks):
@@ -251,8 +251,11 @@ def _range(values: pd.Series) -> str:
 
 
 def _cell(of_method: pd.DataFrame, column: str, mark: int) -> str:
-    """Median and range over the seeds, of the first row of each from the mark on; and how many seeds, if not five."""
-    values = of_method[of_method.env_steps >= mark].sort_values("env_steps").groupby("seed")[column].first()
+    """Median and range over the seeds, of the first row of each from the mark to twice as many steps; and how many
+    seeds, if not five."""
+    values = (
+        of_method[of_method.env_steps.between(mark, 2 * mark)].sort_values("env_steps").groupby("seed")[column].first()
+    )
     if not len(values):
         return ""
     median = f"**{_number(values.median())}**"

@@ -144,6 +144,13 @@ def draw(task: str) -> None:
     figure.savefig(RESULTS.with_name(f"goals_{task}.png"), dpi=90)
 
 
+def read() -> pd.DataFrame:
+    """The rows that there are."""
+    if not RESULTS.exists():
+        return pd.DataFrame(columns=["task", "seed", "settings", "goal"])
+    return pd.read_csv(RESULTS, keep_default_na=False)
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -157,23 +164,18 @@ def main() -> None:
     if given.draw:
         draw(given.draw)
         return
-    rows = (
-        pd.read_csv(RESULTS, keep_default_na=False)
-        if RESULTS.exists()
-        else pd.DataFrame(columns=["task", "seed", "settings", "goal"])
-    )
     settings = " ".join(given.settings)
     for task in () if given.table else given.tasks:
         for seed in seeds_of(given.seeds):
+            rows = read()
             same = (rows.task == task) & (rows.seed == seed) & (rows.settings == settings)
             if (same & ((rows.goal == DRAWN) == given.one)).any():
                 continue
             computed = (one_policy if given.one else archive)(task, seed, given.settings)
-            rows = pd.concat([rows, computed], ignore_index=True)
-            rows.to_csv(RESULTS, index=False)
+            pd.concat([read(), computed], ignore_index=True).to_csv(RESULTS, index=False)  # others may add rows, too
             if seed or given.one:
                 shutil.rmtree(RUNS / f"{task}_{seed}{'_one' * given.one}")
-    print(table(rows))
+    print(table(read()))
 
 
 if __name__ == "__main__":

@@ -196,9 +196,13 @@ def compute(
 
 
 def keep_run(run: Computed) -> bool:
-    """Put a run's curve and its row into the csv files, in the place of older ones, and write the tables."""
+    """Put a run's curve and its row into the csv files, in the place of older ones, and write the tables. One that was
+    interrupted takes the place of no longer one."""
     print(json.dumps(run.row), flush=True)
     of_run = {key: run.row[key] for key in paper_tables.RUN}
+    known = paper_tables.read()
+    if (known[(known[list(of_run)] == pd.Series(of_run)).all(axis="columns")].env_steps > run.row["env_steps"]).any():
+        return run.row["finished"]
     paper_tables.write_curves(paper_tables.with_run(paper_tables.read_curves(), of_run, run.curve.assign(**of_run)))
     paper_tables.write(paper_tables.with_run(paper_tables.read(), of_run, pd.DataFrame([run.row])))
     return run.row["finished"]
