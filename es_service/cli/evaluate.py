@@ -74,7 +74,8 @@ def evaluate(
         str | None,
         typer.Option(
             "--by",
-            help="With --certify: select by return, last_reward, success or goal_distance; default: by task.fitness.",
+            help="With --certify: select by return, last_reward, success or goal_distance; default: by task.fitness, "
+            "or by success in a run that polishes for a target set.",
         ),
     ] = None,
     task: Annotated[

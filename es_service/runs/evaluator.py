@@ -232,7 +232,7 @@ def evaluator(
             ("auto": one for each core of the machine or the cluster), "inline" or "ray", and the Ray cluster to join;
             None: as configured.
         transitions: whether results have all steps of the episodes. They travel from the workers and stay in memory:
-            4 (O + A + B + 1) + 1 bytes for each step: 497 of AntTrap, 33 of PointMaze.
+            4 (O + A + B + 1) + 1 bytes for each step: 497 of AntTrap, 29 of PointMaze.
         on_output: called with the lines that workers print, during calls; see `run`.
 
     Raises:
