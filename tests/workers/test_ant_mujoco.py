@@ -9,6 +9,7 @@ import subprocess
 import sys
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -283,3 +284,16 @@ def test_without_gymnasium_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(TaskError, match=r"pip install 'es-service\[gymnasium\]'"):
         make_environment("ant_trap", {"physics": "mujoco"})
+
+
+@pytest.mark.slow
+def test_an_ant_that_is_thrown_does_not_go_on_at_the_origin_in_c_mujoco(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    ant: Any = gymnasium.make("es_service.gymnasium:es_service/AntMazeMujoco-v0").unwrapped
+    ant.reset(seed=0)
+    thrown = ant.data.qvel.copy()
+    thrown[0] = 1e11
+    ant.set_state(ant.data.qpos.copy(), thrown)
+    observation, reward, *_ = ant.step(np.zeros(8))
+    assert not np.isfinite([reward, *observation]).all()
+    assert np.isfinite(ant.reset(seed=0)[0]).all()

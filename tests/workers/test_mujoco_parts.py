@@ -204,6 +204,56 @@ def test_a_free_body_turns_with_rk4_as_in_c_mujoco():
     np.testing.assert_allclose(state.qvel, data.qvel, atol=1e-5)
 
 
+SLOW = """<mujoco><option timestep="0.02" integrator="RK4"/><worldbody><body pos="0 0 1">
+  <joint name="j" type="hinge" axis="0 1 0" {joint}/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".05" {geom}/>
+  <site name="s" pos=".3 0 0"/></body></worldbody><actuator><general name="m" joint="j" {actuator}/></actuator>
+  <sensor><accelerometer site="s"/><force site="s"/></sensor></mujoco>"""
+
+
+def slow(joint: str = "", geom: str = "", actuator: str = "") -> MjModel:
+    return mujoco.MjModel.from_xml_string(SLOW.format(joint=joint, geom=geom, actuator=actuator))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", ['dyntype="filterexact"', 'dyntype="integrator" actlimited="true" actrange="0 .015"'])
+def test_activations_change_with_rk4_as_in_c_mujoco(more: str):
+    model = slow(actuator=f'dynprm=".02" gainprm="20" {more}')
+    data, mx = mujoco.MjData(model), mujoco_parts.put_model(model)
+    data.ctrl[:] = 1.0
+    mujoco.mj_step(model, data)
+    state = mujoco_parts.step(mx, mujoco_parts.start(mx), np.ones(1, np.float32))
+    for ours, theirs in ((state.qpos, data.qpos), (state.qvel, data.qvel), (state.act, data.act)):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_sensors_of_accelerations_are_computed_without_constraints_too():
+    model = slow(actuator='gainprm="1"')
+    data, mx = mujoco.MjData(model), mujoco_parts.put_model(model)
+    data.qvel[:], data.ctrl[:] = 1.0, 0.5
+    mujoco.mj_forward(model, data)
+    found = mujoco_parts.forward(mx, mujoco_parts.start(mx, qvel=np.ones(1)), np.full(1, 0.5))
+    assert np.abs(data.sensordata).max() > 1.0
+    np.testing.assert_allclose(found.sensordata, data.sensordata, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        ({"joint": 'stiffness="1 20"'}, r"joint 'j' \(stiffnesspoly\)"),
+        ({"joint": 'damping="1 20"'}, r"joint 'j' \(dampingpoly\)"),
+        ({"joint": 'stiffness="5" springyield="0.1"'}, r"joint 'j' \(springyield\)"),
+        ({"geom": 'adhesion="3"'}, r"geom 0 \(adhesion\)"),
+        ({"actuator": 'damping="1"'}, r"actuator 'm' \(damping\)"),
+        ({"actuator": 'armature="1"'}, r"actuator 'm' \(armature\)"),
+    ],
+)
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "jnt_springyield"), reason="they came with MuJoCo 4")
+def test_what_came_with_mujoco_4_and_mjx_lacks_is_refused_by_its_name(parts: dict[str, str], named: str):
+    with pytest.raises(TaskError, match=named):
+        mujoco_parts.put_model(slow(**parts))
+
+
 LYING = """<mujoco><default><geom margin=".004"/></default><worldbody>
   <body><freejoint/><geom type="capsule" size=".02 .05"/></body>
   <body><freejoint/><geom type="cylinder" size=".05 .05"/></body></worldbody></mujoco>"""

@@ -60,6 +60,8 @@ class MujocoAntEnv(gymnasium.Env[Any, Any]):
             )
         spec = SHIPPED[self.task]
         self.model = ant_model(spec.walls or ())
+        # Otherwise MuJoCo would put an ant whose state is not finite at its origin, and go on.
+        self.model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mj.MjData(self.model)
         self.action_space = Box(-1.0, 1.0, (spec.action_size,), np.float32)
         self.observation_space = Box(-np.inf, np.inf, (spec.observation_size,), np.float32)

@@ -188,7 +188,8 @@ def _runge_kutta(
         is_inner = (number == 1) | (number == 2)
         share = jnp.where(number == 0, 0.0, jnp.where(is_inner, 0.5, 1.0))
         weight = jnp.where(is_inner, 1.0 / 3.0, 1.0 / 6.0)
-        at = moved(rates, share)
+        # Only the whole step follows the exponential of an activation and clips it, in C MuJoCo, too.
+        at = moved(rates, share).replace(act=data.act + share * model.opt.timestep * rates[2])
         found = forward(at.replace(qacc_warmstart=data.qacc_warmstart))
         turned = _turning(model, share * model.opt.timestep * rates[0], found.qvel)
         rates = turned, found.qacc, found.act_dot
@@ -255,7 +256,7 @@ def _forward(model: mjx.Model, data: Any, at_once: int) -> Any:
     """`mjx.forward` with the constraints solved by `mujoco_contacts.solve`, whose argument `at_once` is."""
     data = _unsolved(model, data)
     if not data._impl.efc_J.size:
-        return data.replace(qacc=data.qacc_smooth)
+        return sensor.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
     return sensor.sensor_acc(model, solve(model, data, at_once))
 
 
@@ -312,6 +313,18 @@ _OPTIONS = (
 """(option, what MJX has of it, what C MuJoCo has). MJX's own list of integrators has one that its step lacks."""
 
 
+_NEWER = (
+    *(("joint", "mjOBJ_JOINT", f"jnt_{name}") for name in ("stiffnesspoly", "springyield")),
+    ("joint", "mjOBJ_JOINT", "dof_dampingpoly"),
+    *(("tendon", "mjOBJ_TENDON", f"tendon_{name}") for name in ("stiffnesspoly", "dampingpoly", "springyield")),
+    *(("actuator", "mjOBJ_ACTUATOR", f"actuator_{name}") for name in ("damping", "dampingpoly", "armature")),
+    *(("geom", "mjOBJ_GEOM", f"geom_{name}") for name in ("surfacevel", "adhesion")),
+    ("pair", "mjOBJ_PAIR", "pair_adhesion"),
+    ("sensor", "mjOBJ_SENSOR", "sensor_interval"),
+)
+"""(word for an element, its kind, array of the model), of MuJoCo 4: MJX takes it for 0 without a word."""
+
+
 def _word(value: Any) -> str:
     """The last part of the name of a constant of MuJoCo, as in XML."""
     return value.name.rpartition("_")[2].lower()
@@ -346,6 +359,11 @@ def _lacking(model: MjModel) -> Iterator[str]:
     for word, kind in (("actuator", "mjOBJ_ACTUATOR"), ("sensor", "mjOBJ_SENSOR")):
         for at in np.flatnonzero(getattr(model, f"{word}_history")[:, 0]):
             yield f"{named(word, kind, int(at))} (delay)"
+    for word, kind, array in _NEWER:
+        values = np.asarray(getattr(model, array, ()))
+        for at in np.flatnonzero(values.reshape(len(values), -1).any(axis=1)) if values.size else ():
+            at = model.dof_jntid[at] if array.startswith("dof") else at
+            yield f"{named(word, kind, int(at))} ({array.partition('_')[2]})"
     for at in np.flatnonzero(model.geom_fluid.reshape(model.ngeom, -1)[:, :1]) if has_fluid else ():
         yield f"{named('geom', 'mjOBJ_GEOM', int(at))} (fluidshape ellipsoid)"
     for at in range(model.nflex):
