@@ -185,7 +185,7 @@ def _of(process: int) -> NewestOutput:
 
 def cut(descriptor: int, most_bytes: int) -> int:
     """Take away the beginning of a file that others append to, up to the end of a line; returns how many bytes are
-    left."""
+    left. What others write at the same moment may be lost."""
     newest = newest_lines(descriptor, most_bytes)
     os.ftruncate(descriptor, 0)
     os.write(descriptor, newest)

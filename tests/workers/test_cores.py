@@ -130,7 +130,7 @@ if __name__ == "__main__":
     actor.build()
     centre = centre_of(given)
     actor.run(pickle.dumps(({}, {}, pickle.dumps([(centre, TrainingChunk(1, chunk)) for chunk in range(6)]))))
-    time.sleep(1.0)
+    time.sleep(0.1)
     os.write(1, b"the last line\\n")
     os.kill(os.getpid(), 9)
 """
@@ -150,7 +150,9 @@ def test_an_actor_keeps_the_newest_of_the_files_to_which_ray_has_it_write(tmp_pa
     assert done.returncode == -signal.SIGKILL, files[1].read_text()
     text = files[0].read_text()
     assert len(text) <= 100_000
-    assert text.endswith("joint limit reached\nthe last line\n")
+    assert text.endswith("the last line\n")
+    lines = text.splitlines()
+    assert lines.count("joint limit reached") >= len(lines) - 4, "a line may be torn where the file was cut"
     assert "step 39 is done" in files[1].read_text()
 
 
