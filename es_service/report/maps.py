@@ -335,10 +335,10 @@ def over_seeds(runs: Sequence[RunData], over: Over) -> RunData:
 def have_same_cells(runs: Sequence[RunData]) -> bool:
     """Whether all runs have maps, and these have the same cells; those of a dominated map are those of its grid."""
     cells = [tessellation(projected(run.map).geometry) for run in runs if run.map is not None]
+    middles = [one.middles_of(np.arange(one.size)) for one in cells]
     return len(cells) == len(runs) and all(
-        (one.bounds, one.shape) == (cells[0].bounds, cells[0].shape)
-        and np.array_equal(one.middles_of(np.arange(one.size)), cells[0].middles_of(np.arange(one.size)))
-        for one in cells
+        (one.bounds, one.shape) == (cells[0].bounds, cells[0].shape) and np.array_equal(middle_C_B, middles[0])
+        for one, middle_C_B in zip(cells, middles, strict=True)
     )
 
 

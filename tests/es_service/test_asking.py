@@ -97,20 +97,24 @@ def test_policies_act_as_in_the_service_s_own_episodes(policy, tmp_path):
         assert ours.history[column].equals(theirs.history[column]), column
 
 
-def test_what_is_asked_acts_the_same_after_a_pickle_and_only_on_observations_of_all_rows(tmp_path):
-    sizes = {"observation_size": 8, "action_size": 2}
-    config = config_of(task={"environment": "caller", "options": sizes}, policy={"hidden": [64, 64]})
-    with ask_tell(config, tmp_path / "run") as search:
-        asked = search.ask()
-        assert asked is not None
-        seen = np.random.default_rng(0).normal(size=(20, len(asked), 8))
-        expected = [asked.act(one, 0) for one in seen]
-        copy = pickle.loads(pickle.dumps(asked))
-        np.testing.assert_array_equal([copy.act(one, 0) for one in seen], expected)
-        assert not copy.parameters.flags.writeable
-        for shape in ((8,), (1, 8), (len(asked), 1)):
-            with pytest.raises(ConfigError, match="observations must have the shape"):
-                asked.act(np.zeros(shape), 0)
+@pytest.mark.parametrize("policy", [{"hidden": [64, 64]}, {"hidden": [16], "memory": 2}], ids=str)
+def test_what_is_asked_acts_the_same_after_a_pickle_and_only_on_observations_of_all_rows(policy, tmp_path):
+    task = {"environment": "caller", "options": {"observation_size": 8, "action_size": 2}}
+    with ask_tell(config_of(task=task, policy=policy), tmp_path / "run") as search:
+        for _ in range(3):  # initial centres, members, new centres
+            asked = search.ask()
+            assert asked is not None
+            unused = pickle.dumps(asked)
+            seen = np.random.default_rng(0).normal(size=(20, len(asked), 8))
+            expected = [asked.act(one, 0) for one in seen]
+            assert len(pickle.dumps(asked)) == len(unused), "what `act` has made does not travel"
+            for copy in map(pickle.loads, (unused, pickle.dumps(asked))):
+                np.testing.assert_array_equal([copy.act(one, 0) for one in seen], expected)
+                assert not copy.parameters.flags.writeable
+            for shape in ((8,), (1, 8), (len(asked), 1)):
+                with pytest.raises(ConfigError, match="observations must have the shape"):
+                    asked.act(np.zeros(shape), 0)
+            search.tell(asked, np.arange(len(asked), dtype=float), np.zeros((len(asked), 2)))
 
 
 def test_a_generation_may_be_a_number_of_numpy(tmp_path, workers_here):

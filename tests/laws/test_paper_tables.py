@@ -162,6 +162,8 @@ def test_certified_rows_replace_those_of_the_same_run_and_the_median_is_over_see
     assert "**20** (10 to 50, 3 seeds) | **2,000** (2,000 to 2,000, 2 seeds) |" in certified.in_words(table)
     wanted = [certified.Wanted(Path("ant_trap_es.yaml"), seed, (10**7, 10**8)) for seed in range(4)]
     assert [one.seed for one in certified.missing(wanted, table)] == [1, 3]
+    only_later = rows(0, (10**8, 7.0)).assign(method="me_es")
+    assert "| me_es |  |  |  |  |  |  | **7** (1 seed) |" in certified.in_words(only_later)
     polished = [one._replace(polished=True) for one in wanted]
     assert certified.missing(polished, table) == polished, "rows of a search are not those of what polishes its elites"
 
