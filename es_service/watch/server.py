@@ -112,7 +112,10 @@ def _host(request: Request) -> str:
 def _is_from_elsewhere(request: Request) -> bool:
     """Whether a browser says that a page of another origin has sent the request."""
     origin = request.headers.get("origin")
-    other = origin is not None and urlsplit(origin).netloc != request.headers.get("host")
+    try:
+        other = origin is not None and urlsplit(origin).netloc != request.headers.get("host")
+    except ValueError:  # it is no address
+        other = True
     return other or request.headers.get("sec-fetch-site", "same-origin") != "same-origin"
 
 
@@ -124,6 +127,7 @@ ASSETS = {
     "live.css": ("es_service.watch", "text/css"),
     "live.js": ("es_service.watch", "text/javascript"),
 }
+EVENTS = "text/event-stream"
 MOST_COMPARED = 50
 MOST_REPLAYS = 16
 """Replays that are kept for the next viewer."""
@@ -178,6 +182,9 @@ class Site:
         return Response(asset(name, package), media_type=kind)
 
     async def _events(self, request: Request) -> Response:
+        if request.method == "HEAD":  # the stream would not end
+            await self._drawer(request)
+            return Response(media_type=EVENTS)
         name = request.path_params["page"]
         if name == "compare":
             name += f"?{request.url.query}"
@@ -187,7 +194,7 @@ class Site:
                 self._channels[name] = PageChannel(draw, lambda: self._ended(name), self._allowance)
                 if reading is not None:
                     self._readings[name] = reading
-        return StreamingResponse(self._channels[name].stream(), media_type="text/event-stream")
+        return StreamingResponse(self._channels[name].stream(), media_type=EVENTS)
 
     def _ended(self, name: str) -> None:
         del self._channels[name]

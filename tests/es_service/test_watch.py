@@ -323,12 +323,20 @@ def test_without_a_token_only_names_of_this_machine_are_answered(tmp_path):
         assert get(app, "/", host=host)[0] == 403
 
 
+def test_the_head_of_a_stream_ends(tmp_path):
+    app = site(tmp_path).app(None)
+    status, headers, body = get(app, "/events/list", method="HEAD")
+    assert (status, headers["content-type"].partition(";")[0], body) == (200, "text/event-stream", "")
+    assert get(app, "/events/run/x", method="HEAD")[0] == 404
+
+
 def test_another_page_cannot_have_replays_recorded(tmp_path):
     write_run(tmp_path / "a", generations=1)
     app, key = site(tmp_path).app(None), key_of(tmp_path, f"{tmp_path.name}/a")
     path = f"/run/{key}/replay/nothing"
     assert get(app, path, method="POST", origin="http://localhost:8642", sec_fetch_site="same-origin")[0] == 404
-    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}, {"sec_fetch_site": "cross-site"}):
+    of_others = ("http://evil.example", "null", "http://[")
+    for headers in (*({"origin": origin} for origin in of_others), {"sec_fetch_site": "cross-site"}):
         assert get(app, path, method="POST", **headers)[0] == 403
     assert get(app, f"/run/{key}/replay/best")[0] == 405  # it is no link
 

@@ -332,6 +332,8 @@ def test_what_cannot_be_had_is_named(monkeypatch: pytest.MonkeyPatch):
         describe_environment("mujoco:Ants-v5")
     with pytest.raises(TaskError, match=r"task\.options\.healthy_z_range = \[1\] is not allowed; must be two numbers"):
         describe_environment("mujoco:Walker2d-v5", {"options": {"healthy_z_range": [1]}})
+    with pytest.raises(TaskError, match=r"task\.options\.main_body = -1 is not allowed; must be 1 to 13, the bodies"):
+        describe_environment("mujoco:Ant-v5", {"options": {"main_body": -1}})
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(
         TaskError, match=r"the package gymnasium is not installed; .*pip install 'es-service\[gymnasium\]'"

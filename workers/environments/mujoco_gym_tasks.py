@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from workers.environments import TaskError
 from workers.environments.mujoco_contacts import AT_ONCE
 from workers.environments.mujoco_gym_parts import (
     GymState,
@@ -53,6 +54,10 @@ def _ant(
     exclude_current_positions_from_observation: bool = True,
     include_cfrc_ext_in_observation: bool = True,
 ) -> Parts:
+    if not 0 < main_body < model.c.nbody:
+        allowed = f"1 to {model.c.nbody - 1}, the bodies of the model"
+        raise TaskError(f"task.options.main_body = {main_body} is not allowed; must be {allowed}")
+
     def look(data: Any, stepped: bool) -> Any:
         """Place of the main body, and forces on the bodies."""
         forces = body_forces(model, data, stepped)

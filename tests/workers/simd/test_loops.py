@@ -417,6 +417,14 @@ def test_a_loop_ends_as_soon_as_no_lane_needs_another_trip(function: Callable[..
     np.testing.assert_array_equal(kernel(HALVES), [2.0**k * row for k, row in enumerate(HALVES)])
 
 
+def test_a_loop_over_no_elements_makes_no_trip() -> None:
+    def function(x: Any) -> Any:
+        return jnp.concatenate([jax.vmap(doubled)(x[:0].reshape(0, 1)).ravel(), x])
+
+    x = np.float32([0.5, 2.0])
+    np.testing.assert_array_equal(compile_kernel(function, jax.ShapeDtypeStruct((2,), jnp.float32))(x[None])[0], x)
+
+
 def test_no_trip_of_an_inner_loop_is_made_for_lanes_that_do_not_need_it() -> None:
     def by_branches(x):
         return lax.cond(x[1] > 0, doubled, lambda x: x, x)

@@ -102,7 +102,8 @@ def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
         return t.closed(params["cond_jaxpr"], [*for_condition, *carry])[0]
 
     def condition(carry: list[Nodes]) -> Nodes:
-        return np.array(functools.reduce(functools.partial(t.graph.op, "or"), elements(carry).reshape(-1).tolist()))
+        going, none = elements(carry).reshape(-1).tolist(), int(t.constants(np.bool_(False))[()])
+        return np.array(functools.reduce(functools.partial(t.graph.op, "or"), going, none))
 
     def body(carry: list[Nodes]) -> list[Nodes]:
         going, after = elements(carry), t.closed(params["body_jaxpr"], [*for_body, *carry])
