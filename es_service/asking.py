@@ -45,7 +45,7 @@ from es_service.runs.sessions import Listener
 from es_service.runs.view import Run, open_run
 from es_service.store.folder import holds_run
 from workers.asked_rows import Rows, gradients, results_of, rows_of
-from workers.policies.policy import LanePolicies
+from workers.policy import LanePolicies
 
 MOST_STEPS = 2**31 - 1
 LEFT = "the block of ask_tell was left; make the same call again to go on"

@@ -31,7 +31,7 @@ from es_service.protocol.noise import KEY_WORDS, seed_of
 from es_service.protocol.options import ParameterSpec
 from es_service.protocol.policies import explicit
 from workers.compiling import Compilable
-from workers.policies.policy import gradient_summer, members
+from workers.policy import gradient_summer, members
 from workers.rollouts.backend import ChunkFunctions, Episodes
 from workers.worker import Kind, kinds_of
 

@@ -30,7 +30,7 @@ from es_service.protocol.rollouts import choose
 from es_service.protocol.sources import SUITES
 from workers.environments import TaskError, choices_of, describe_environment, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment, HostTask
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
 TRIAL_STEPS = 60

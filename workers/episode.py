@@ -21,7 +21,7 @@ from es_service.protocol.episodes import AT_THE_END, METRICS, OF_STEPS
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
-from workers.policies.policy import action, drawn_action, initial_memory, normalise
+from workers.policy import action, drawn_action, initial_memory, normalise
 from workers.rollouts.backend import BAD_REWARD, NO_FAULT, Episodes
 
 

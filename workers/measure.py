@@ -14,7 +14,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol.rollouts import why_not
 from workers.describe import described
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.rollouts import BACKENDS
 from workers.rollouts.backend import RolloutBackend
 

@@ -24,7 +24,7 @@ from es_service.protocol.policy_spec import PolicySpec, layers_of_noise, numbers
 from workers.compiling import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
-from workers.policies.policy import act, split_layers
+from workers.policy import act, split_layers
 
 ActOfLanes = Callable[[Any, Any], tuple[Any, Any]]
 """Function (memory_L_H, observation_L_O) -> (outputs_L_A, memory_L_H) of the policies of all lanes, as `act`."""

@@ -36,7 +36,7 @@ from es_service.runs.signals import stop_on_signals
 from es_service.runs.verification import compared, examined
 from es_service.store.folder import is_network_filesystem
 from workers.describe import MOST_STEPS, TRIED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.target import NoVectorsError, host_target
 from workers.simd.episodes.kernel import compile_kernel
 

@@ -14,15 +14,8 @@ from typing import Any
 
 from es_service.dispatch import node_probe
 from es_service.dispatch.ray_calls import error_text
-from es_service.dispatch.ray_cluster import (
-    HEAD_CALL,
-    connect,
-    disconnect,
-    grpc_module,
-    require_node,
-    status_code,
-    uses_tls,
-)
+from es_service.dispatch.ray_cluster import connect, disconnect, require_node
+from es_service.dispatch.ray_head import HEAD_CALL, grpc_module, status_code, uses_tls
 from es_service.errors import EvaluationError
 from es_service.protocol.sources import in_words, other_files
 

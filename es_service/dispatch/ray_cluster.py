@@ -1,5 +1,4 @@
-"""Joining or starting a Ray cluster: whether its head is there and accepts this process, staying connected for the next
-run, and watching its nodes.
+"""Joining or starting a Ray cluster, and staying connected to it for the next run.
 
 After each call, the caller's signal handlers and environment variables are the same as before.
 """
@@ -7,7 +6,6 @@ After each call, the caller's signal handlers and environment variables are the 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import os
 import platform
@@ -24,155 +22,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from es_service.config.model import ENGINE_IMPLIES
-from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, ask_head, cores_of_nodes, read_membership
+from es_service.dispatch.ray_head import require_head
+from es_service.dispatch.ray_nodes import MEMBERSHIP_S, SILENCE_S, WITHOUT_RAY, ask_head, cores_of_nodes
 from es_service.dispatch.staying import staying
-from es_service.errors import EvaluationError, Interrupted, StartError, WayOut
+from es_service.errors import Interrupted, StartError
 from es_service.logs import logger
-from es_service.protocol.machine import given_path
 from es_service.protocol.process_environment import child_environment
-
-# Whether the head of a Ray cluster is at an address and accepts this process, which Ray itself takes a minute to say.
-#
-# If this host uses TLS, the calls do so, too, because Ray accepts only the certificates of its own authority then.
-
-HEAD_CALL = "/ray.rpc.NodeInfoGcsService/CheckAlive"
-"""A call of Ray's protocol to its head that changes nothing and takes an empty message."""
-CONNECT_S = 3.0
-"""Longest time in seconds to connect to a port; a lost packet is sent again after one second."""
-CALL_S = 4.0
-"""Longest wait for an answer, in seconds."""
-
-
-def uses_tls() -> bool:
-    """Whether Ray uses TLS on this host."""
-    return os.environ.get("RAY_USE_TLS", "0").lower() in ("1", "true")
-
-
-def require_head(address: str, *, is_auto: bool = False) -> None:
-    """Raise StartError unless the head of a Ray cluster is at HOST:PORT and accepts the token of this process.
-
-    Args:
-        is_auto: whether the address was found and not given: then Ray uses a token also if RAY_AUTH_MODE is not set.
-    """
-    grpc = grpc_module()
-    problem = _why_no_connection(grpc, address) or _why_refused(grpc, address, is_auto)
-    if problem:
-        text = f"could not connect to a Ray cluster at {address}: {problem}"
-        raise StartError(text, field="compute.address", value=address)
-
-
-def status_code(grpc: Any, target: str, call: str, token: str | None = None) -> Any:
-    """Status code with which a call with an empty message fails; None if it is answered."""
-    metadata = None if token is None else [("authorization", f"Bearer {token}")]
-    with _channel(grpc, target) as channel:
-        try:
-            channel.unary_unary(call)(b"", timeout=CALL_S, metadata=metadata)
-        except grpc.RpcError as error:
-            return error.code()
-    return None
-
-
-def grpc_module() -> Any:
-    """The module `grpc`, which the extra installs."""
-    try:
-        return importlib.import_module("grpc")
-    except ImportError as error:
-        ways_out = [WayOut("install", "install it", extra="cluster")]
-        raise StartError(f"checks of a cluster need the extra `cluster` ({error})", ways_out=ways_out) from error
-
-
-def _why_no_connection(grpc: Any, address: str) -> str:
-    """Why no gRPC server can be reached at an address; empty if one can."""
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
-        return "an address is HOST:PORT, or auto on a machine of the cluster"
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
-    except (OSError, OverflowError) as error:  # a port above 65535 overflows
-        return (
-            f"nothing listens at that address ({getattr(error, 'strerror', None) or error}). Give the address of "
-            "its head, HOST:PORT (usually port 6379), or auto on a machine of the cluster"
-        )
-    with _channel(grpc, address) as channel:
-        try:
-            grpc.channel_ready_future(channel).result(timeout=CALL_S)
-        except grpc.FutureTimeoutError:
-            tls = "this host uses TLS, so the cluster must" if uses_tls() else "if the cluster uses TLS, this host must"
-            return f"its port is open, but gives no answer within {CALL_S:g} s; {tls}, too"
-    return ""
-
-
-def _why_refused(grpc: Any, address: str, is_auto: bool) -> str:
-    """Why the server at an address accepts no call of this process; empty if it does."""
-    code, (token, source) = status_code(grpc, address, HEAD_CALL), _token(is_auto)
-    asks = code == grpc.StatusCode.UNAUTHENTICATED
-    if asks and token is None:
-        return (
-            f"the cluster asks for a token, and {source}. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to the token of "
-            "the cluster"
-        )
-    if asks:
-        code = status_code(grpc, address, HEAD_CALL, token)
-    if code == grpc.StatusCode.UNAUTHENTICATED:
-        return f"the token in {source} is not the cluster's. Set RAY_AUTH_TOKEN to the token of the cluster"
-    if code is not None:
-        return (
-            f"the server there does not answer as the head of a Ray cluster does ({code.name}). Give the port with "
-            "which its head was started, usually 6379"
-        )
-    if not asks and _mode() == "token":
-        return (
-            "the cluster uses no token, but RAY_AUTH_MODE=token is set here, with which no worker would start there. "
-            "Unset RAY_AUTH_MODE, or start the cluster with a token, which is safer"
-        )
-    return ""
-
-
-def _mode(default: str = "") -> str:
-    return os.environ.get("RAY_AUTH_MODE", default).lower()
-
-
-def _token(is_auto: bool) -> tuple[str | None, str]:
-    """The token that Ray sends from this process, and where it is from; or None, and why it sends none."""
-    given = os.environ.get("RAY_AUTH_TOKEN")
-    if _mode("token" if is_auto else "") != "token":
-        return (
-            None,
-            f"this process sends {'that in RAY_AUTH_TOKEN only if RAY_AUTH_MODE is token' if given else 'none'}",
-        )
-    if given:
-        return given.strip(), "RAY_AUTH_TOKEN"
-    path = os.environ.get("RAY_AUTH_TOKEN_PATH") or "~/.ray/auth_token"
-    try:
-        return given_path(path).read_text().strip(), path
-    except OSError:
-        return None, f"there is none in RAY_AUTH_TOKEN or {path}"
-
-
-def _channel(grpc: Any, target: str) -> Any:
-    if not uses_tls():
-        return grpc.insecure_channel(target)
-    names = ("RAY_TLS_CA_CERT", "RAY_TLS_SERVER_KEY", "RAY_TLS_SERVER_CERT")
-    try:
-        read = [Path(os.environ[name]).read_bytes() for name in names]
-    except (KeyError, OSError) as error:
-        raise StartError(
-            f"RAY_USE_TLS is set, so {', '.join(names)} must name the files of certificates ({error})"
-        ) from error
-    return grpc.secure_channel(target, grpc.ssl_channel_credentials(*read))
-
 
 _LOG = logger(__name__)
 OBJECT_STORE_BYTES = 200 * 2**20
 """Shared memory of a local Ray, for a few centres and gradient blocks. Ray would take a third of the machine's memory.
 """
-MEMBERSHIP_S = 1.0
-"""Seconds between two queries for the nodes of a cluster."""
-SILENCE_S = 20.0
-"""Seconds without an answer after which a cluster is considered lost. Ray would end this process after a minute."""
-PAUSE_S = 5.0
-"""If `Watch.latest` was not called for this many seconds, the time without an answer is counted from the next call."""
 TOKEN = secrets.token_hex(32)
 """Authentication token of every Ray that this process starts, since Ray reads the token of a process only once.
 Without it, Ray would write a token into the home folder."""
@@ -186,12 +46,6 @@ LOCAL_SETTINGS = {
     "RAY_enable_metrics_collection": "0",
 }
 """More environment variables for a Ray of our own. Without them, Ray's records take a tenth of a small generation."""
-WITHOUT_RAY = WayOut(
-    "resume",
-    "work on this machine without Ray",
-    settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"},
-)
-"""Suggestion for errors of Ray. The number of workers was that of a cluster."""
 
 
 def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
@@ -446,52 +300,6 @@ def _job(ray: ModuleType) -> tuple[str, str]:
     """What tells a connection from a later one."""
     context = ray.get_runtime_context()
     return context.get_node_id(), context.get_job_id()
-
-
-class Watch:
-    """Regular queries for the nodes of a cluster, in a separate thread because a query may block."""
-
-    def __init__(self, ray: ModuleType, claim: Claim) -> None:
-        self._ray, self._claim = ray, claim
-        self._latest = read_membership(ray, claim)
-        self._answered_s = self._asked_s = time.monotonic()
-        self._is_replaced = False
-        self._end = threading.Event()
-        threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
-
-    def latest(self) -> Membership:
-        """The latest answer. Raises EvaluationError if there was none for more than SILENCE_S seconds, or if another
-        cluster answers at the same address."""
-        if self._is_replaced:
-            raise EvaluationError(
-                "the Ray cluster has ended, and another one was started at its address. Resume the run there, or on "
-                "this machine alone",
-                ways_out=[WITHOUT_RAY],
-            )
-        now = time.monotonic()
-        if now - self._asked_s > PAUSE_S:  # this process was stopped or busy, so the cluster may have answered
-            self._answered_s = now
-        self._asked_s = now
-        silent_s = now - self._answered_s
-        if silent_s > SILENCE_S:
-            raise EvaluationError(
-                f"the Ray cluster has not answered for {silent_s:.0f} s; its head node has ended or cannot be reached. "
-                "Start a cluster again and resume the run there, or resume it on this machine alone",
-                ways_out=[WITHOUT_RAY],
-            )
-        return self._latest
-
-    def close(self) -> None:
-        """End the queries."""
-        self._end.set()
-
-    def _run(self) -> None:
-        while not self._end.wait(MEMBERSHIP_S):
-            try:
-                self._latest = read_membership(self._ray, self._claim)
-                self._answered_s = time.monotonic()
-            except Exception as error:  # of any class; it means that there is no answer
-                self._is_replaced = OTHER_CLUSTER in str(error)
 
 
 def _session_folder(ray: ModuleType) -> Path | None:

@@ -42,8 +42,8 @@ from es_service.dispatch.ray_calls import (
     fault_reason,
     raised_in_actor,
 )
-from es_service.dispatch.ray_cluster import Connection, Watch, connected
-from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
+from es_service.dispatch.ray_cluster import Connection, connected
+from es_service.dispatch.ray_nodes import Claim, Growth, Membership, Watch, emptiest, layout, shortage, with_work
 from es_service.dispatch.staying import use_of
 from es_service.protocol.machine import cores
 from es_service.protocol.messages import Report, Work, WorkerPlace, WorkerSpec

@@ -1,15 +1,18 @@
-"""The nodes of a Ray cluster: what a worker claims of a node, and for how many workers there is room."""
+"""The nodes of a Ray cluster: what a worker claims of a node, for how many workers there is room, and watching them."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 
+from es_service.config.model import ENGINE_IMPLIES
 from es_service.dispatch.events import Limits
-from es_service.errors import StartError
+from es_service.errors import EvaluationError, StartError, WayOut
 from es_service.protocol.policies import ALL_TOGETHER
 
 
@@ -32,6 +35,18 @@ OTHER_CLUSTER = "WrongClusterID"
 ASKED_AHEAD = 32
 """Most workers for which a cluster has no room, and for which a run with `workers: auto` still asks. An autoscaler sees
 them as demand and starts nodes for them. Each of them is an actor that Ray must keep."""
+MEMBERSHIP_S = 1.0
+"""Seconds between two queries for the nodes of a cluster."""
+SILENCE_S = 20.0
+"""Seconds without an answer after which a cluster is considered lost. Ray would end this process after a minute."""
+PAUSE_S = 5.0
+"""If `Watch.latest` was not called for this many seconds, the time without an answer is counted from the next call."""
+WITHOUT_RAY = WayOut(
+    "resume",
+    "work on this machine without Ray",
+    settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"},
+)
+"""Suggestion for errors of Ray. The number of workers was that of a cluster."""
 
 
 @dataclass(frozen=True)
@@ -220,3 +235,49 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
 def _resources(amounts: dict[str, float]) -> str:
     """Text with the numbers of CPUs and GPUs."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
+
+
+class Watch:
+    """Regular queries for the nodes of a cluster, in a separate thread because a query may block."""
+
+    def __init__(self, ray: ModuleType, claim: Claim) -> None:
+        self._ray, self._claim = ray, claim
+        self._latest = read_membership(ray, claim)
+        self._answered_s = self._asked_s = time.monotonic()
+        self._is_replaced = False
+        self._end = threading.Event()
+        threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
+
+    def latest(self) -> Membership:
+        """The latest answer. Raises EvaluationError if there was none for more than SILENCE_S seconds, or if another
+        cluster answers at the same address."""
+        if self._is_replaced:
+            raise EvaluationError(
+                "the Ray cluster has ended, and another one was started at its address. Resume the run there, or on "
+                "this machine alone",
+                ways_out=[WITHOUT_RAY],
+            )
+        now = time.monotonic()
+        if now - self._asked_s > PAUSE_S:  # this process was stopped or busy, so the cluster may have answered
+            self._answered_s = now
+        self._asked_s = now
+        silent_s = now - self._answered_s
+        if silent_s > SILENCE_S:
+            raise EvaluationError(
+                f"the Ray cluster has not answered for {silent_s:.0f} s; its head node has ended or cannot be reached. "
+                "Start a cluster again and resume the run there, or resume it on this machine alone",
+                ways_out=[WITHOUT_RAY],
+            )
+        return self._latest
+
+    def close(self) -> None:
+        """End the queries."""
+        self._end.set()
+
+    def _run(self) -> None:
+        while not self._end.wait(MEMBERSHIP_S):
+            try:
+                self._latest = read_membership(self._ray, self._claim)
+                self._answered_s = time.monotonic()
+            except Exception as error:  # of any class; it means that there is no answer
+                self._is_replaced = OTHER_CLUSTER in str(error)

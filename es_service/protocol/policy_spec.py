@@ -35,7 +35,7 @@ class PolicySpec:
     activation: Activation = "tanh"
     """Function after each hidden layer."""
     output: PolicyOutput = "tanh"
-    """What makes an action of the last layer; see `workers.policies.policy`."""
+    """What makes an action of the last layer; see `workers.policy`."""
     bias: bool = True
     """Whether the layers have biases."""
     memory: int = 0

@@ -96,7 +96,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     [O], `best_std` [O], `centre_parameters`, ..., `certified_parameters`, ...; for N elites `cell` [N, dimensions of
     the map], `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters`
     [N, D], `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases,
-    layer after layer; those of a memory are of its gates and its candidate (`workers/policies/policy.py`). If the task
+    layer after layer; those of a memory are of its gates and its candidate (`workers/policy.py`). If the task
     is a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
     snapshot = run.at(named=named_by_all)

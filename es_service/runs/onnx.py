@@ -103,7 +103,7 @@ def onnx_model(policy: Policy, about: dict[str, str] | None = None) -> Any:
 
 
 def _memory(g: _Graph, layers: Sequence[tuple[Any, Any]], size: int, x: str) -> str:
-    """The gated recurrent cell of `workers.policies.policy`."""
+    """The gated recurrent cell of `workers.policy`."""
     gates, candidate = layers
     both = g.node("Sigmoid", g.dense(g.node("Concat", x, MEMORY, axis=-1), gates))
     reset, keep = g.columns(both, 0, size), g.columns(both, size, 2 * size)

@@ -57,7 +57,7 @@ from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.compiling import Compilable
 from workers.cores import parts
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.reports import Reports
 from workers.worker import Made
 

@@ -44,7 +44,7 @@ from es_service.store.create import SEVERAL
 from es_service.store.lock import RunLock
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 _LOG = logger(__name__)
 LONG_PLACING_S = 2.0

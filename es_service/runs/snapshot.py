@@ -28,7 +28,7 @@ from es_service.search.steps import STEPS
 from es_service.store import reader
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
-from workers.policies.policy import act, action, dense_of_each, initial_memory, normalise, split_layers
+from workers.policy import act, action, dense_of_each, initial_memory, normalise, split_layers
 
 if TYPE_CHECKING:
     import pandas as pd

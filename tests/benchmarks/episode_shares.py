@@ -29,7 +29,7 @@ from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import aligned, compile_object, load_object, words_of

@@ -20,7 +20,7 @@ from es_service import api
 from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.protocol.messages import Centre, Chunk, EvaluationChunk, TrainingChunk
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.target import ISAS, host_target
 from workers.worker import make_worker
 

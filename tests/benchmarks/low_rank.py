@@ -20,7 +20,7 @@ from es_service.config.tasks import task_of
 from es_service.config.workload import worker_spec
 from es_service.protocol.messages import Centre, Chunk, GradientChunk, TrainingChunk
 from es_service.runs.checked_config import load_config
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.worker import make_worker
 
 CASES = {"point_maze": [64, 64], "ant_maze": [256, 256], "brax:ant": [700, 700, 700]}

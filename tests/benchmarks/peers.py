@@ -39,7 +39,7 @@ from tests.benchmarks.rollouts_per_second import ANT_STEPS, config_of, measure
 from tests.helpers import centre
 from workers.environments.ant import SUBSTEPS
 from workers.environments.ant_tasks import STEP_S
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results" / "peers.csv"

@@ -49,7 +49,7 @@ from es_service.protocol.messages import EpisodesResult, EvaluationChunk, Traini
 from tests.helpers import centre
 from workers.environments import Environment
 from workers.episode import EpisodeSteps, episode_steps
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.worker import make_worker
 
 ROUNDS = 5

@@ -9,7 +9,7 @@ import es_service
 from tests.benchmarks.baselines.episodes import certification_episodes
 from tests.benchmarks.baselines.our_run import OurRun
 from tests.benchmarks.baselines.rows import COLUMNS, in_words, put, read
-from workers.policies.policy import act, split_layers
+from workers.policy import act, split_layers
 
 
 @pytest.mark.usefixtures("workers_here")

@@ -25,7 +25,7 @@ from es_service.errors import EvaluationError
 from es_service.protocol.machine import VERSION
 
 VERSIONS = {"ray": "2.60.0", "python": "3.11.2", "es-service": "0.8.0", "jax": "0.10.2", "cpu": "A 1/1 avx2"}
-CODE = {"workers/worker.py": "a", "workers/policies/policy.py": "b"}
+CODE = {"workers/worker.py": "a", "workers/policy.py": "b"}
 OURS = "ray 2.60.0, python 3.11.2, es-service 0.8.0"
 HERE = {"versions": VERSIONS, "sources": CODE, "problem": ""}
 
@@ -71,14 +71,14 @@ def test_nothing_is_in_order_if_no_node_answers():
             ("other versions: jax 0.9.0 (here 0.10.2), ray 2.59.0 (here 2.60.0); ", "constraints.txt"),
         ),
         (
-            said(second=HERE | {"sources": CODE | {"workers/policies/policy.py": "c"}}),
+            said(second=HERE | {"sources": CODE | {"workers/policy.py": "c"}}),
             "FAIL",
-            ("other code than here in workers/policies/policy.py;",),
+            ("other code than here in workers/policy.py;",),
         ),
         (
             said(second=HERE | {"sources": {"workers/worker.py": "a"}}),
             "FAIL",
-            ("other code than here in workers/policies/policy.py;",),
+            ("other code than here in workers/policy.py;",),
         ),
         (
             said(second=HERE | {"sources": {}, "problem": "ModuleNotFoundError: No module named 'es_service'"}),
@@ -108,7 +108,7 @@ def test_each_problem_is_one_line_that_names_the_node_and_what_to_do(found, leve
 
 
 def test_nodes_with_the_same_problem_are_named_together():
-    wrong = HERE | {"sources": {**CODE, "workers/policies/policy.py": "c"}}
+    wrong = HERE | {"sources": {**CODE, "workers/policy.py": "c"}}
     [(_, text)] = said(first=wrong, second=wrong)
     assert text.startswith("one 10.0.0.1, two 10.0.0.2: other code")
 

@@ -185,10 +185,10 @@ class Head:
 
 def test_a_cluster_that_was_replaced_by_another_at_its_address_is_named_at_once(monkeypatch):
     """Ray waits for a head node where it is asked for nodes, and ends the process if that is a new one."""
-    monkeypatch.setattr(ray_cluster, "MEMBERSHIP_S", 0.001)
-    monkeypatch.setattr(ray_cluster, "SILENCE_S", 60.0)
+    monkeypatch.setattr(ray_nodes, "MEMBERSHIP_S", 0.001)
+    monkeypatch.setattr(ray_nodes, "SILENCE_S", 60.0)
     head = Head()
-    watch = ray_cluster.Watch(head, ray_nodes.ONE_CORE)  # pyright: ignore[reportArgumentType]
+    watch = ray_nodes.Watch(head, ray_nodes.ONE_CORE)  # pyright: ignore[reportArgumentType]
     try:
         nodes = watch.latest()
         head.error = RuntimeError("timed out while waiting for GCS")
@@ -204,7 +204,7 @@ def test_a_cluster_that_was_replaced_by_another_at_its_address_is_named_at_once(
         watch.close()
 
 
-def says(watch: ray_cluster.Watch, text: str) -> bool:
+def says(watch: ray_nodes.Watch, text: str) -> bool:
     """Whether a watch has an error with this text."""
     try:
         watch.latest()

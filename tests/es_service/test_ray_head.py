@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from es_service.dispatch import ray_cluster
-from es_service.dispatch.ray_cluster import HEAD_CALL, grpc_module, require_head, status_code
+from es_service.dispatch import ray_head
+from es_service.dispatch.ray_head import HEAD_CALL, grpc_module, require_head, status_code
 from es_service.errors import EvaluationError
 
 
@@ -18,7 +18,7 @@ def head(request, monkeypatch):
     """A gRPC server that answers as the head of a cluster whose token is `right` (None: without tokens); returns its
     address."""
     token = getattr(request, "param", "right")
-    monkeypatch.setattr(ray_cluster, "CALL_S", 2.0)
+    monkeypatch.setattr(ray_head, "CALL_S", 2.0)
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_USE_TLS"):
         monkeypatch.delenv(name, raising=False)
     grpc = importlib.import_module("grpc")
@@ -83,7 +83,7 @@ def test_a_token_that_the_cluster_does_not_ask_for_is_refused(head, monkeypatch)
 
 
 def test_a_server_that_is_no_head_is_named(head, monkeypatch):
-    monkeypatch.setattr(ray_cluster, "HEAD_CALL", "/ray.rpc.NodeManagerService/GetSystemConfig")
+    monkeypatch.setattr(ray_head, "HEAD_CALL", "/ray.rpc.NodeManagerService/GetSystemConfig")
     with pytest.raises(
         EvaluationError, match=f"at {head}: the server there does not answer as the head .*UNIMPLEMENTED"
     ):
@@ -104,7 +104,7 @@ def test_an_address_where_nothing_answers_is_named(address, reason):
 
 
 def test_a_server_that_gives_no_answer_is_named_soon(monkeypatch):
-    monkeypatch.setattr(ray_cluster, "CALL_S", 0.5)
+    monkeypatch.setattr(ray_head, "CALL_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(

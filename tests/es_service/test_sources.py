@@ -109,7 +109,7 @@ def own(tmp_path, monkeypatch):
     """A user's folder: a task with its physics, a search in a package, and modules that neither of them uses."""
     for name, text in {
         "my_task.py": "import json\nimport numpy\n\ndef f():\n    from my_physics import g\n",
-        "my_physics.py": "import my_constants\nimport workers.policies.policy\n",
+        "my_physics.py": "import my_constants\nimport workers.policy\n",
         "my_constants.py": "raise RuntimeError('imported')",
         "my_notes.py": "",
         "my_searches/__init__.py": "",
@@ -194,7 +194,7 @@ def test_many_files_are_told_in_few_words():
     assert in_words([f"{n}.py" for n in range(7)]) == "0.py, 1.py, 2.py, 3.py, 4.py and 2 others"
 
 
-OTHER = {**WORKERS, "workers/policies/policy.py": "0" * 32, "workers/gone.py": "0" * 32}
+OTHER = {**WORKERS, "workers/policy.py": "0" * 32, "workers/gone.py": "0" * 32}
 
 
 def test_a_worker_with_other_code_names_host_and_files(monkeypatch):
@@ -207,8 +207,8 @@ def test_a_worker_with_other_code_names_host_and_files(monkeypatch):
     )
     problem = why_refused(OTHER, ["point_maze"])
     assert problem.startswith("node-7 has other code")
-    assert "workers/gone.py, workers/policies/policy.py." in problem
-    with pytest.raises(OtherCodeError, match=r"node-7 has other code.*workers/policies/policy\.py"):
+    assert "workers/gone.py, workers/policy.py." in problem
+    with pytest.raises(OtherCodeError, match=r"node-7 has other code.*workers/policy\.py"):
         WorkerActor(pickle.dumps(replace(SPEC, sources=OTHER)), 0).build()
 
 
@@ -218,7 +218,7 @@ def test_a_child_with_other_code_is_refused(threads):
     with inline_engine(spec, limits, threads=threads) as engine, pytest.raises(EvaluationError) as caught:
         engine.evaluate([(centre(random_parameters()), TrainingChunk(1, 0))])
     assert "has other code than the driver" in str(caught.value)
-    assert "workers/gone.py, workers/policies/policy.py" in str(caught.value)
+    assert "workers/gone.py, workers/policy.py" in str(caught.value)
 
 
 def test_a_worker_of_another_architecture_is_refused():

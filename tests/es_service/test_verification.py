@@ -136,10 +136,10 @@ def test_what_computed_the_run_otherwise_is_told_of_equal_and_of_other_bits(tmp_
     run = computed(tmp_path / "run")
     now, code = verification.platform_info(), dict(verification.code_of(api.load_config(CONFIG)))
     monkeypatch.setattr(verification, "platform_info", lambda: {**now, "jax": "99.0"})
-    monkeypatch.setattr(verification, "code_of", lambda config: {**code, "workers/policies/policy.py": "another"})
+    monkeypatch.setattr(verification, "code_of", lambda config: {**code, "workers/policy.py": "another"})
     worker.flip = (12, GradientResult, "sum_D")
     for one in verify(run):
-        assert one.changes == (f"jax {now['jax']} -> 99.0", "other code in workers/policies/policy.py")
+        assert one.changes == (f"jax {now['jax']} -> 99.0", "other code in workers/policy.py")
         assert bool(one.differences) is (one.last == 12)
 
 

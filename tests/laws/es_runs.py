@@ -8,7 +8,7 @@ from es_service.protocol.messages import EpisodesResult, PolicySpec
 from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import DirectEvaluator, MemoryStore
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 SHAPE = PolicySpec((2, 8, 8, 2))
 

@@ -14,7 +14,7 @@ from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import DirectEvaluator, MemoryStore, rows_of
 from tests.references.behaviour_map import cell_number
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 SHAPE = PolicySpec((2, 8, 8, 2))
 CELLS, BLOCK = (20, 15), 3

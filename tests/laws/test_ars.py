@@ -15,7 +15,7 @@ from es_service.search.steps import STEPS
 from tests.laws.es_runs import Tampering, run_in_memory, small_config
 from tests.references import ars as reference
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 LINEAR = {"hidden": [], "action_noise": 0.0}
 

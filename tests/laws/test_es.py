@@ -26,7 +26,7 @@ from tests.helpers import AtTheEnd, MemoryStore
 from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
 from tests.references import es as reference
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend import target
 from workers.simd.episodes import compiled
 from workers.simd.episodes import rollout as simd_rollout

@@ -29,7 +29,7 @@ from tests.laws.me_es_runs import (
 from tests.references import me_es as reference
 from tests.references.behaviour_map import GridMap, coverage, qd_score
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 
 @pytest.mark.parametrize("mode", ["explore", "exploit", "explore_exploit"])

@@ -23,7 +23,7 @@ from tests.es_service.config_examples import load_config
 from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
 TASK = SHIPPED["point_maze"]

@@ -26,7 +26,7 @@ from tests.laws import me_es_runs
 from tests.laws.me_es_runs import SHAPE
 from tests.references import novelty_search as reference
 from workers.environments import SHIPPED
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 
 RULE = {"fitness_weight_start": 0.6, "fitness_weight_step": 0.15, "fitness_weight_patience": 2}
 STARTS = {"es": 1.0, "ns_es": 0.0, "nsr_es": 0.5, "nsra_es": 0.6}

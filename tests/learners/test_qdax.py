@@ -19,7 +19,7 @@ from tests.benchmarks.baselines.map_run import MapRun, transitions_of
 from tests.benchmarks.baselines.policies import flat, of_skills
 from tests.benchmarks.baselines.rows import COLUMNS
 from tests.benchmarks.baselines.run import Run, relu_config
-from workers.policies.policy import act, split_layers
+from workers.policy import act, split_layers
 
 
 def arrays(run: Run) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ from es_service.protocol.policies import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.references import point_maze
 from workers.compiling import Compilable
-from workers.policies.policy import act, action, drawn_action, normalise, split_layers
+from workers.policy import act, action, drawn_action, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 NO_JAX = """

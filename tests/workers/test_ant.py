@@ -32,7 +32,7 @@ from workers.environments import SHIPPED, make_environment
 from workers.environments.ant import AntState, contact_forces, load_system, observe
 from workers.environments.ant_tasks import STEP_S
 from workers.environments.brax_task import pipeline
-from workers.policies.policy import act, initial_parameters, split_layers
+from workers.policy import act, initial_parameters, split_layers
 from workers.simd.episodes import rollout as simd
 from workers.worker import episode_keys
 

@@ -41,7 +41,7 @@ from workers.environments import TaskError, describe_environment, make_host_task
 from workers.environments.gymnasium_task import KeyedGenerator
 from workers.environments.host_task import HostEnvironment, unchanged
 from workers.host.episodes import EnvironmentPool
-from workers.policies.policy import LanePolicies
+from workers.policy import LanePolicies
 from workers.worker import make_worker
 
 MODULE = "tests.workers.host_tasks"

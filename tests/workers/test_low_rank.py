@@ -15,7 +15,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from es_service.protocol.policy_spec import LayerNoise, layers_of_noise, noise_integers, numbers
 from tests import helpers
 from tests.helpers import centre, chunk_runner, random_parameters
-from workers.policies.policy import act, gradient_summer, initial_memory, initial_parameters, members, split_layers
+from workers.policy import act, gradient_summer, initial_memory, initial_parameters, members, split_layers
 from workers.simd.episodes.low_rank import make_low_rank_gradient_sum
 from workers.xla import act_low_rank
 

@@ -20,7 +20,7 @@ from tests.workers.test_policies import bits, evaluate
 from workers import environments
 from workers.environments import SHIPPED, Environment
 from workers.episode import OUTPUTS
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.worker import episode_keys
 
 

@@ -12,7 +12,7 @@ from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from tests import helpers
 from workers.environments import make_environment
-from workers.policies.policy import act, initial_memory, initial_parameters, split_layers
+from workers.policy import act, initial_memory, initial_parameters, split_layers
 from workers.worker import episode_keys
 from workers.xla import act_in_pairs, make_training_rollout
 

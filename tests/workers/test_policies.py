@@ -18,7 +18,7 @@ from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from tests.helpers import PARAMETERS, SPEC, DirectEvaluator, centre, random_parameters, spec
 from tests.workers.simd.rollouts import targets, task_spec
 from workers.environments import make_environment
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.native import aligned
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes

@@ -18,7 +18,7 @@ from tests.examples.swing_up import SwingUp
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.numpy_rollout import NumPy
 from workers.environments import SHIPPED
-from workers.policies.policy import action, drawn_action, initial_parameters
+from workers.policy import action, drawn_action, initial_parameters
 from workers.rollouts import BACKENDS
 
 KINDS = [

@@ -27,7 +27,7 @@ from workers.environments.suite_task import (
     require_known,
     suite_module,
 )
-from workers.policies.policy import action, drawn_action
+from workers.policy import action, drawn_action
 from workers.simd.episodes.kernel import compile_kernel
 
 SEEDS, STEPS = 20, 50

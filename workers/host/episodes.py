@@ -19,7 +19,7 @@ from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
 from es_service.protocol.noise import seed_of
 from workers import progress
 from workers.environments.host_task import HostEnvironment, HostTask
-from workers.policies.policy import LanePolicies
+from workers.policy import LanePolicies
 from workers.rollouts.backend import Episodes, FailedEpisode, observation_text, raised_in_lane
 
 

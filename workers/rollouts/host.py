@@ -17,7 +17,7 @@ from workers.compiling import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
 from workers.host import episodes as host_episodes  # modules, which import `rollouts.backend` in turn
 from workers.host import functions as host_functions
-from workers.policies.policy import gradient_summer, members
+from workers.policy import gradient_summer, members
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 

@@ -38,7 +38,7 @@ from tests.benchmarks.gpu.kernels import (
 )
 from workers.environments import make_environment
 from workers.episode import episode_steps
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.native import pack
 from workers.simd.backend.ptx import ptx
 from workers.simd.backend.target import target_of

@@ -27,7 +27,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, strea
 from tests.benchmarks.gpu.policies import WAYS, Way
 from workers import environments
 from workers.episode import episode_steps
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.rollouts.jax_tasks import without_scatters
 from workers.worker import episode_keys
 from workers.xla import make_training_rollout

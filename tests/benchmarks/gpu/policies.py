@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import SIGNS, PolicySpec
-from workers.policies.policy import act, activated, split_layers
+from workers.policy import act, activated, split_layers
 
 SIGNS_S = np.asarray(SIGNS, np.float32)
 

@@ -14,7 +14,7 @@ from tests.helpers import spec
 from tests.workers.simd.emulated import arm_targets
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.target import ISAS, NoVectorsError, host_target
 from workers.simd.episodes import rollout
 

@@ -13,7 +13,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from tests import helpers
 from tests.workers.simd.host_gpu import HostGpu, single_lanes
 from workers.environments import make_environment
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.native import WrongCodeError
 from workers.simd.episodes.rollout import make_training_rollout
 from workers.simd.gpu.training import episodes_on_gpu

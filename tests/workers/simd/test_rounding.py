@@ -21,7 +21,7 @@ from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from tests.helpers import spec
 from workers.environments import SHIPPED, describe_environment, make_environment
-from workers.policies.policy import initial_parameters
+from workers.policy import initial_parameters
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import aligned, load_compiled, pack
 from workers.simd.backend.target import host_target

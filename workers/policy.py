@@ -116,7 +116,7 @@ def act(
         dense: function of a layer before its activation.
 
     Returns:
-        (outputs of the last layer, of which `workers.policies.policy` makes an action; the memory after the step)
+        (outputs of the last layer, of which `workers.policy` makes an action; the memory after the step)
     """
     hidden = spec.layers[: len(spec.widths) - 2]
     x = observation_O
