@@ -13,6 +13,8 @@ from qdax.baselines.diayn import DIAYN, DiaynConfig
 from qdax.core.neuroevolution.networks.networks import MLP
 
 import es_service
+from es_service.config.tasks import task_of
+from es_service.config.workload import policy_spec
 from tests.benchmarks.baselines.cem_run import CemRun
 from tests.benchmarks.baselines.diayn_run import DiaynRun, Ring
 from tests.benchmarks.baselines.map_run import MapRun, transitions_of
@@ -70,7 +72,7 @@ def test_a_run_that_was_stopped_learns_the_same(tmp_path, system):
 def ours(parameters_N_D: np.ndarray, observation_E_O: np.ndarray) -> np.ndarray:
     """Actions [N, E, A] of our policies."""
     config = es_service.load_config(relu_config("point_maze", 0))
-    shape = es_service.config.model.worker_spec(config, es_service.config.tasks.task_of(config)).policy
+    shape = policy_spec(config, task_of(config))
     return np.stack([act(np, shape, split_layers(shape, one), None, observation_E_O)[0] for one in parameters_N_D])
 
 

@@ -234,10 +234,10 @@ def test_a_comparison_is_shown_and_different_tasks_are_refused(page, tmp_path):
     table = "document.querySelector('#final .scroll')"
     assert page.value(f"{table}.scrollWidth <= {table}.clientWidth"), "no column is cut off"
     page.move(".chart .x-env_steps", 0.5)
-    assert "environment steps: seed 0 -" in page.text(".chart .at")
+    assert "environment steps: seed = 0 -" in page.text(".chart .at")
     page.click('input[value="wall_clock_s"]')
     page.move(".chart .x-wall_clock_s", 0.5)
-    assert "seconds: seed 0 -" in page.text(".chart .at")
+    assert "seconds: seed = 0 -" in page.text(".chart .at")
     other = write_run(tmp_path / "other", task=SHIPPED["ant_trap"])
     code, printed = es("report", runs[0], other, "--out", tmp_path / "wrong.html")
     assert code == 2

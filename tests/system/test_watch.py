@@ -108,7 +108,7 @@ def test_a_run_that_goes_on_is_killed_and_is_resumed_is_seen(page, tmp_path):
         page.until("document.body?.dataset.pictures > 0")
         assert "There is no run yet" in page.text("main")
         with start(folder, config=GOES_ON) as process:
-            page.until("/^1 runs, of which 1 are running/.test(document.querySelector('.verdict')?.textContent)")
+            page.until("/^1 run, 1 of them running/.test(document.querySelector('.verdict')?.textContent)")
             page.click("a[href^='/run/']")
             page.until("!!document.querySelector('#map .way')")
             generation, cells = page.value(GENERATIONS), page.value(CELLS)
