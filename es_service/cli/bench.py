@@ -205,7 +205,7 @@ def scaling(
     from es_service.runs.scaling import bench_scaling
 
     counts = workers.split(",")
-    if not all(count.strip().isdigit() and int(count) for count in counts):
+    if not all(count.strip().isdecimal() and int(count) for count in counts):
         raise ConfigError(f"--workers {workers}: must be whole numbers, each at least 1, such as {SCALING_WORKERS}")
     rows = bench_scaling(load_config(config, overrides(set_)), [int(count) for count in counts], cores_per_node)
     if as_json:

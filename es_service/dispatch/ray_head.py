@@ -63,7 +63,7 @@ def grpc_module() -> Any:
 def _why_no_connection(grpc: Any, address: str) -> str:
     """Why no gRPC server can be reached at an address; empty if one can."""
     host, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
+    if not colon or not port.isdecimal() or "://" in host:
         return "an address is HOST:PORT, or auto on a machine of the cluster"
     try:
         socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()

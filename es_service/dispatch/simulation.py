@@ -75,7 +75,7 @@ def predict(
     actors: int,
     cores: int,
     longest_part: Callable[[int], float],
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], float] = time.thread_time,
     slowness: Callable[[int], float] = lambda actor: 1.0,
     late_factor: float = events.Limits.late_factor,
 ) -> Prediction:
@@ -85,7 +85,7 @@ def predict(
         actors: number of actors, which are the workers of the scheduler.
         cores: cores of each.
         longest_part: number of chunks in a work item -> number of chunks that the busiest core of an actor runs.
-        clock: measures the time of the scheduler.
+        clock: measures the time of the scheduler, of this thread alone, since others may compute beside it.
         slowness: number of an actor -> how many times as long as in `costs` it takes for a chunk.
         late_factor: as in `Limits`; infinity: no item is sent a second time.
     """

@@ -25,6 +25,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.ray_engine import ray_engine
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
+from es_service.errors import ConfigError
 from es_service.loop import driver
 from es_service.loop.budget import REACHED
 from es_service.loop.evaluated import policies_asked
@@ -81,8 +82,16 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
 
     Measured are the duration of each kind of chunk on one core, with the initial policies; a generation of the driver
     and the store with such results; and messages between the Ray engine and actors on this machine. A network makes
-    messages slower. Raises EvaluationError if Ray or the task cannot be used.
+    messages slower. Actors have the cores that the config gives each, or all of a node.
+
+    Raises:
+        ConfigError: a number of workers is no multiple of `compute.worker_resources.cpu`. EvaluationError: Ray or the
+            task cannot be used.
     """
+    each = config.compute.worker_resources.cpu
+    if each != "auto" and (uneven := [count for count in workers if count % each]):
+        field = "compute.worker_resources.cpu"
+        raise ConfigError(f"{field}: {each} cores each do not divide {uneven[0]} workers", field=field, value=each)
     search, spec, phases = config.search, worker_spec(config, task_of(config)), _phases(config)
     centres = _initial_centres(config, spec)
     works = [_work(phase, centres, spec, config) for phase in phases]
@@ -92,7 +101,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     costs = Costs(chunk_s, message_s, way_s, *_driver_cost(config, answers), chunk_message_s)
     steps = _steps(search, answers)
     for count in workers:
-        cores = actor_cores([cores_per_node], count, None)
+        cores = actor_cores([cores_per_node], count, None) if each == "auto" else each
         prediction = predict(phases, costs, count // cores, cores, partial(longest_part, cores=cores))
         yield {
             "workers": count,

@@ -94,6 +94,8 @@ def test_a_server_that_is_no_head_is_named(head, monkeypatch):
     ("address", "reason"),
     [
         ("127.0.0.1", "an address is HOST:PORT, or auto"),
+        ("127.0.0.1:²", "an address is HOST:PORT, or auto"),
+        ("http://127.0.0.1:1", "an address is HOST:PORT, or auto"),
         ("127.0.0.1:1", r"nothing listens at that address \(Connection refused\)"),
         ("127.0.0.1:99999", "nothing listens at that address "),
     ],

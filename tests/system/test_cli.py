@@ -85,6 +85,9 @@ def test_bench_scaling_predicts_a_row_per_number_of_workers():
     assert many["limit"] in ("too few items", "the driver", "evaluation")
     code, printed = es("bench", "scaling", "point_maze_es", "--workers", "1,none")
     assert (code, "--workers 1,none: must be whole numbers" in printed) == (2, True)
+    eight = ("--set", "compute.worker_resources.cpu=8", "--set", "compute.engine=ray")
+    code, printed = es("bench", "scaling", "point_maze_es", *eight, "--workers", "16,12")
+    assert (code, "8 cores each do not divide 12 workers" in printed) == (2, True)
 
 
 @pytest.mark.long
