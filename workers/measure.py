@@ -43,7 +43,7 @@ def measure(
         steps_per_second, compile_seconds (without a policy this excludes resets) and peak_mib; or only `problem`, if
         the rollout cannot compute the task or cannot run on this machine.
     """
-    size = SHIPPED[task] if task in SHIPPED else described(task)
+    size = SHIPPED[task] if task in SHIPPED else described(task, {"options": options})
     shape, backend = PolicySpec((size.observation_size, *hidden, size.action_size)), BACKENDS[rollout]
     if problem := why_not(backend, size, shape, here=True):
         return {"problem": problem}

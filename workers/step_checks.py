@@ -69,7 +69,7 @@ def _digests(environment: Environment, task: TaskSpec) -> dict[str, str]:
 
     reset, state = traced(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
     action, before = jax.ShapeDtypeStruct((task.action_size,), jnp.float32), jax.ShapeDtypeStruct((), bool)
-    return {
+    found = {
         "reset": reset,
         "observe": traced(environment.observe, state)[0],
         "step": traced(environment.step, state, action)[0],
@@ -77,6 +77,9 @@ def _digests(environment: Environment, task: TaskSpec) -> dict[str, str]:
         "goal_distance": traced(environment.goal_distance, state)[0],
         "success": traced(environment.success, state, before)[0],
     }
+    if environment.metrics is not None:
+        found["metrics"] = traced(environment.metrics, state)[0]
+    return found
 
 
 @dataclass(frozen=True)

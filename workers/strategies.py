@@ -194,8 +194,13 @@ def _state_form(settings: Settings) -> Any:
     if made.has_population:
         population_N_D = np.zeros((algorithm.population_size, algorithm.num_dims), np.float32)
         fitness_N = np.zeros(algorithm.population_size, np.float32)
-        return jax.eval_shape(algorithm.init, key, population_N_D, fitness_N, made.params)
-    return jax.eval_shape(algorithm.init, key, mean_D, made.params)
+        state = jax.eval_shape(algorithm.init, key, population_N_D, fitness_N, made.params)
+    else:
+        state = jax.eval_shape(algorithm.init, key, mean_D, made.params)
+    members = jax.eval_shape(algorithm.ask, key, state, made.params)[0].shape[0]
+    if members != settings.members:
+        raise RefusedError(f"evosax:{settings.name} asks for {members} members instead of {settings.members}")
+    return state
 
 
 def _leaves(state: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from es_service.cli.main import main
 from es_service.dispatch.staying import workers
 from es_service.errors import Interrupted
 from es_service.protocol.child import answer_parent
-from es_service.runs.signals import interrupt
+from es_service.runs.signals import EARLY, interrupt
 
 
 def commands(program: str) -> Callable[[Sequence[str], str], int]:
@@ -31,6 +31,7 @@ def commands(program: str) -> Callable[[Sequence[str], str], int]:
             for stream in (sys.stdout, sys.stderr):
                 os.dup2(file.fileno(), stream.fileno())
         sys.argv = [program, *words]
+        EARLY.number = None  # a signal was for the command before
         try:
             main()
         except SystemExit as ended:

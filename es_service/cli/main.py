@@ -11,11 +11,8 @@ import contextlib
 import io
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -47,14 +44,13 @@ from es_service.cli.common import (
 from es_service.cli.evaluate import evaluate
 from es_service.cli.jobs import job_commands
 from es_service.cli.report import export, report, watch
-from es_service.cli.session import polish, session, told_to_user, verify
+from es_service.cli.session import naming, polish, session, told_to_user, verify
 from es_service.cli.show import config_, digest_, help_, list_
 from es_service.cli.status import status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
-from es_service.config.changes import again_with
 from es_service.config.given import parse_overrides
 from es_service.config.workload import parallel_sentence
-from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
+from es_service.errors import ConfigError, Interrupted, NotInRunError, WayOut
 from es_service.logs import logger
 from es_service.protocol.machine import VERSION
 from es_service.runs.signals import EARLY
@@ -112,7 +108,7 @@ def run(
             print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
     shown = {"show_output": show_output, "as_json": as_json}
-    with _naming(config, wanted):
+    with naming(WayOut("run", "", settings=parse_overrides(wanted)[0], config=str(config))):
         session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log, **shown)
 
 
@@ -231,18 +227,3 @@ def _interruption(ended: SystemExit) -> Interrupted | None:
             return error if isinstance(error, Interrupted) else Interrupted(EARLY.number or signal.SIGINT)
         error = error.__cause__ or error.__context__
     return None
-
-
-@contextlib.contextmanager
-def _naming(config: Path, wanted: Sequence[str]) -> Iterator[None]:
-    """Add the config and the settings of this command to the ways out of an error that start a run: the call that they
-    repeat has them in one `RunConfig`."""
-    try:
-        yield
-    except ServiceError as error:
-        call = WayOut("run", "", settings=parse_overrides(wanted)[0], config=str(config))
-        error.ways_out = tuple(
-            again_with(replace(call, out=way.out), way.purpose, way.settings) if way.action == "run" else way
-            for way in error.ways_out
-        )
-        raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,13 +37,15 @@ from es_service.cli.common import (
 )
 from es_service.cli.status import print_certified, print_summary
 from es_service.cli.sweep import ParallelOption, SeedsOption, polish_goals
+from es_service.config.changes import again_with
+from es_service.config.given import parse_overrides
 from es_service.errors import ConfigError, Interrupted, RunLockedError, ServiceError, WayOut
 from es_service.loop.history import Row
 from es_service.loop.state import Observer
 from es_service.protocol.user_code import users_error
 from es_service.report.progress import ShowNotice, ShowRow, print_notice, show_progress
 from es_service.runs.checked_config import changed_config
-from es_service.runs.tracking import tracked
+from es_service.runs.tracking import check_trackers, tracked
 from es_service.runs.verification import (
     Recomputed,
     RecomputedCertification,
@@ -51,6 +53,7 @@ from es_service.runs.verification import (
     why_not_repeatable,
 )
 from es_service.runs.verification import verify as recompute
+from es_service.store.create import refuse_taken
 from es_service.store.folder import holds_run
 
 
@@ -60,6 +63,19 @@ def told_to_user(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceEr
         return error
     text = users_error(error)
     return ServiceError(text, ways_out=ways_out) if text else None
+
+
+@contextlib.contextmanager
+def naming(call: WayOut) -> Iterator[None]:
+    """Make the ways out of an error that start a run repeat this command: the code that raises it has only a config."""
+    try:
+        yield
+    except ServiceError as error:
+        error.ways_out = tuple(
+            again_with(replace(call, out=way.out), way.purpose, way.settings) if way.action == "run" else way
+            for way in error.ways_out
+        )
+        raise
 
 
 def session(
@@ -169,8 +185,11 @@ def polish(
     config = polish_config(parent, wanted)
     folder = out if out is not None else api.default_folder(config)
     told = partial(print_notice, errors), output_shown(show_output)
+    check_trackers(log or ())
+    refuse_taken(folder)
     before = certified_for(api.open_run(parent), config, *told, workers=workers)  # first: a driver may hold the parent
-    session(folder, partial(api.run, config, folder), log, show_output=show_output)
+    with naming(WayOut("polish", "", str(parent), parse_overrides(wanted)[0])):
+        session(folder, partial(api.run, config, folder), log, show_output=show_output)
     after = certified_for(api.open_run(folder), config, *told, workers=workers, centre=True)
     for what, certified in (("before", before), ("after", after)):
         print_line(console, f"certified {what} polishing:")

@@ -342,7 +342,8 @@ def signal_handlers_kept() -> Iterator[set[int]]:
         finally:
             sys.unraisablehook = report
             for number, handler in before.items():
-                signal.signal(number, handler)
+                if handler is not None:  # None: it is not Python's
+                    signal.signal(number, handler)
             signal.set_wakeup_fd(fd_before)
             with contextlib.suppress(BlockingIOError):
                 arrived.update(noted.recv(4096))

@@ -175,6 +175,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._observation_N_O[:] = seen.observation
         if self._trails is not None:
             self._trails.move(np.arange(self.num_envs), seen.descriptor)
+        self._is_over_N = terminated_N | truncated_N
         info: dict[str, Any] = {}
         shown = {name: array.copy() for name, array in info_of(self.task, seen).items()}
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and over_before_N.any():
@@ -189,7 +190,6 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 final_obs[lane] = seen.observation[lane].copy()
             info |= self._masked({"final_obs": final_obs, "final_info": self._info(last, lane_M)}, lane_M)
             self._put(shown, self._begin(lane_M), lane_M)
-        self._is_over_N = terminated_N | truncated_N
         info |= self._masked(shown, np.arange(self.num_envs))
         return self._returned(), reward_N, terminated_N, truncated_N, info
 

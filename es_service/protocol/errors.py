@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Action = Literal["run", "resume", "fork", "watch", "report", "certify", "ask_tell", "install"]
+Action = Literal["run", "resume", "fork", "polish", "watch", "report", "certify", "ask_tell", "install"]
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class WayOut:
 
     action: Action
     """run, resume, fork and ask_tell are functions; watch stands for `open_run`, report for `write_report`, certify for
-    `certify_run`, and install for an installation of an extra."""
+    `certify_run`, polish for the command, and install for an installation of an extra."""
     purpose: str
     """What it achieves, as words that follow "to", such as "continue it"."""
     run: str | None = None

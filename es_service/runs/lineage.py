@@ -335,8 +335,8 @@ def certified_for(
     centre: bool = False,
 ) -> list[Certified]:
     """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, of
-    which none has decided that the run is over, and selected by the same measure before and after. What is not
-    certified so is certified now.
+    which none has decided that the run is over, and selected by the same measure before and after, from the run as it
+    is now. What is not certified so is certified now.
 
     Args:
         config: that of the run that polishes.
@@ -345,11 +345,11 @@ def certified_for(
     Raises:
         RunLockedError: a driver writes to the run. Otherwise as `certify_run`.
     """
-    by = default_measure(config)
+    by, steps = default_measure(config), int(run.history_rows(run.generation)[-1]["env_steps"])
     certified = [
         policy
         for policy in certified_policies(run.folder)
-        if policy.selected_by == by and policy.episodes.count >= EPISODES
+        if (policy.selected_by, policy.env_steps) == (by, steps) and policy.episodes.count >= EPISODES
     ]
     if certified:
         newest = max(policy.number for policy in certified)

@@ -52,15 +52,24 @@ def interrupt(number: int, frame: object) -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Catch SIGINT and SIGTERM inside the block. In other threads, Python cannot catch them."""
+    """Catch SIGINT and SIGTERM inside the block. In other threads, Python cannot catch them, nor a signal whose handler
+    is not Python's.
+
+    Where a command has installed `interrupt`, the next block begins with the signal of one that has ended since.
+    """
     request = StopRequest()
     request.number = EARLY.number
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    before = {number: signal.signal(number, request.handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in before.items() if handler is not None}
+    for number in before:
+        signal.signal(number, request.handle)
     try:
         yield request
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    if request.number is not None and before.get(signal.Signals(request.number)) is interrupt:
+        EARLY.number = request.number

@@ -24,7 +24,7 @@ import numpy as np
 from es_service.config.given import Overrides, Source
 from es_service.config.model import RunConfig
 from es_service.config.text import unknown_name
-from es_service.errors import ForkedError, Interrupted, RunLockedError, StoreError, counted
+from es_service.errors import ConfigError, ForkedError, Interrupted, RunLockedError, StoreError, counted
 from es_service.logs import logger
 from es_service.loop.budget import limits_of, only_started, spent
 from es_service.loop.history import Row
@@ -37,6 +37,7 @@ from es_service.runs.run_status import INSIDE, recent_durations, write_groups
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.sweep_plan import Labelled, PlannedRun, ValuesOfKeys, plan
+from es_service.runs.view import open_run
 from es_service.runs.worker_count import shared
 from es_service.store.folder import explained, holds_run
 from es_service.store.lock import acquire_lock
@@ -97,14 +98,21 @@ class RunCommands:
         if self.certifying is None or state == "stopped":
             return self.run if state == "waiting" else []
         limits = self.certifying.next_limits(self.planned, row, ended=state == "finished")
-        if limits is None:
-            return []
+        if limits is None:  # it has ended before a stop, which goes
+            return self.run if self._has_a_stop() else []
         if state == "finished" or (
             row is not None and any(row.get(key, -math.inf) >= at for key, at in limits.items())
         ):
             return self.certify
         whole = {key: math.ceil(at) if key == "env_steps" else at for key, at in limits.items()}  # steps are whole
         return [*self.run, *(f"--set=budget.{key}={at}" for key, at in whole.items())]
+
+    def _has_a_stop(self) -> bool:
+        """Whether the run's budget is that of a certification before its end."""
+        with suppress(StoreError, ConfigError):
+            budget = open_run(self.planned.folder).present_config["budget"]
+            return any(budget.get(key) != getattr(self.planned.config.budget, key) for key in COSTS)
+        return False
 
 
 def command_of(

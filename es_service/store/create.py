@@ -116,14 +116,14 @@ def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: 
         StoreError: the folder is not empty or cannot be written.
     """
     try:
-        _refuse_taken(folder)
+        refuse_taken(folder)
         # An existing folder may be a mount point or the current folder of a process, which a rename must not replace.
         beside = not folder.is_dir()
         place = folder.absolute().parent / f".{folder.name}.creating" if beside else folder
         _make_folder(place, folder)
         lock = acquire_lock(place)
         try:
-            _refuse_taken(folder)  # another process may have created a run here before this one got the lock
+            refuse_taken(folder)  # another process may have created a run here before this one got the lock
             _build(place, config_yaml, meta, beginning)
             if beside:
                 _move(place, folder)
@@ -195,7 +195,8 @@ def _remove(folder: Path, *, whole: bool) -> None:
             folder.rmdir()
 
 
-def _refuse_taken(folder: Path) -> None:
+def refuse_taken(folder: Path) -> None:
+    """Raise StoreError if a run cannot be created in a folder, since there is something."""
     if not folder.exists():
         return
     if not folder.is_dir():

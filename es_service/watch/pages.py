@@ -151,19 +151,26 @@ def _run_picture(data: RunData, *, whole: bool) -> Picture:
 
 
 def draw_comparison(
-    readings: Sequence[tuple[FoundRun, RunReading]], keys: Sequence[str]
+    readings: Sequence[tuple[FoundRun, RunReading]], keys: Sequence[str], left_out: int = 0
 ) -> Callable[[], Picture | None]:
-    """What draws the comparison of runs; arguments as of `comparison_sections`."""
+    """What draws the comparison of runs.
+
+    Args:
+        keys: as of `comparison_sections`.
+        left_out: number of further runs that were asked for.
+    """
     drawn: Any = None
+    first = f"Only the first {len(readings)} of {len(readings) + left_out} runs are compared here; report compares all."
 
     def draw() -> Picture | None:
         nonlocal drawn
-        notices, changed = [], []
+        notices, changed, unread = [first] if left_out else [], [], []
         for _, reading in readings:
             try:
                 changed.append(reading.update())
             except ServiceError as error:
                 notices.append(error.sentence)
+                unread.append(reading)
         used = [
             reading for _, reading in readings if reading.data is not None and reading.data.history["generation"].size
         ]
@@ -182,7 +189,8 @@ def draw_comparison(
             notices = [*notices, error.sentence]
         shown = {"live": _notice(*notices)} if notices else {}
         of = {SECTION_OF[name]: {name: script} for name, script in scripts.items()}
-        return Picture(title, shown | sections, of, not all(each_reading.whole for each_reading in used))
+        more = any(not each_reading.whole for each_reading in used if each_reading not in unread)
+        return Picture(title, shown | sections, of, more)
 
     return draw
 

@@ -6,6 +6,7 @@ Reading and drawing are done in threads, a replay by a child process of one more
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import hmac
 import json
 import secrets
@@ -68,6 +69,8 @@ class Guard:
     def __init__(self, app: ASGIApp, token: str | None) -> None:
         """`token`: what a viewer must know; None: requests must be for a name of this machine."""
         self._app, self._token = app, token
+        # Several pages may be served on one host, and browsers keep the same cookies for all of its ports.
+        self._cookie = f"{COOKIE}-{hashlib.sha256((token or '').encode()).hexdigest()[:8]}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: Message) -> None:
@@ -90,10 +93,10 @@ class Guard:
         if given is not None and self._is_token(given):
             rest = urlencode([pair for pair in request.query_params.multi_items() if pair[0] != "token"])
             answer = RedirectResponse(request.url.path + (f"?{rest}" if rest else ""), 303)
-            answer.set_cookie(COOKIE, self._token, httponly=True, samesite="strict")
+            answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
             return answer
         bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
-        if self._is_token(request.cookies.get(COOKIE, "")) or self._is_token(bearer):
+        if self._is_token(request.cookies.get(self._cookie, "")) or self._is_token(bearer):
             return None
         told = "open the address with the token that `es-service watch` has printed\n"
         return PlainTextResponse(told, 401, {"WWW-Authenticate": "Bearer"})
@@ -129,6 +132,8 @@ ASSETS = {
 }
 EVENTS = "text/event-stream"
 MOST_COMPARED = 50
+MOST_DIGITS = 12
+"""Digits of the number of a cell."""
 MOST_REPLAYS = 16
 """Replays that are kept for the next viewer."""
 _READING = ThreadPoolExecutor(4, "reading")
@@ -151,7 +156,7 @@ class Site:
         routes = [
             Route("/", self._list),
             Route("/run/{key}", self._run),
-            Route("/run/{key}/cell/{cell:int}", self._cell),
+            Route("/run/{key}/cell/{cell}", self._cell),
             Route("/run/{key}/replay/{which}", self._replay, methods=["POST"]),
             Route("/compare", self._compare),
             Route("/events/{page:path}", self._events),
@@ -210,9 +215,10 @@ class Site:
                 reading = RunReading(run)
                 return pages.draw_run(self._runs, run, reading), reading
             case ["compare"]:
-                keys = list(dict.fromkeys(request.query_params.getlist("run")))[:MOST_COMPARED]
-                compared = [(run, RunReading(run)) for run in [await self._found(key) for key in keys]]
-                return pages.draw_comparison(compared, request.query_params.getlist("group_by")), None
+                keys = list(dict.fromkeys(request.query_params.getlist("run")))
+                found = [await self._found(key) for key in keys[:MOST_COMPARED]]
+                group_by, compared = request.query_params.getlist("group_by"), [(run, RunReading(run)) for run in found]
+                return pages.draw_comparison(compared, group_by, left_out=len(keys) - len(found)), None
         raise HTTPException(404)
 
     async def _found(self, key: str) -> FoundRun:
@@ -223,7 +229,7 @@ class Site:
 
     async def _cell(self, request: Request) -> Response:
         """The path of an elite, and the call that evaluates it."""
-        run, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
+        run, cell = await self._found(request.path_params["key"]), _cell(request.path_params["cell"])
         return _json(await _answer(_READING, lambda: self._details(run, cell)))
 
     def _details(self, run: FoundRun, cell: int) -> dict[str, Any]:
@@ -271,9 +277,17 @@ class Site:
 
 
 def _place(data: RunData, cell: str) -> tuple[int, ...]:
-    if data.map is None or not cell.isdecimal() or int(cell) not in data.map.cell_N:
+    number = _cell(cell)
+    if data.map is None or number not in data.map.cell_N:
         raise HTTPException(404, "this cell is empty")
-    return tuple(map(int, data.map.geometry.index_of(int(cell))))
+    return tuple(map(int, data.map.geometry.index_of(number)))
+
+
+def _cell(text: str) -> int:
+    """The number of a cell. Raises HTTPException if it cannot be one."""
+    if not text.isdecimal() or len(text) > MOST_DIGITS:
+        raise HTTPException(404, "there is no such cell")
+    return int(text)
 
 
 def _generation(data: RunData, cell: int) -> int:

@@ -145,6 +145,18 @@ def test_the_state_goes_on_in_other_environments():
     same(single.step([0.5, -0.5]), other.step([0.5, -0.5]))
 
 
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_state_after_an_automatic_reset_goes_on_in_any_mode(mode):
+    envs = TaskVectorEnv("point_maze", 2, max_episode_steps=3, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs.reset(seed=3)
+    first, second, third, fourth = actions_of(envs, 4)
+    for one in (first, second, third):
+        envs.step(one)
+    other = TaskVectorEnv("point_maze", 2, max_episode_steps=3, autoreset_mode=mode)
+    other.set_state(envs.get_state())
+    same(envs.step(fourth), other.step(fourth))
+
+
 @pytest.mark.parametrize("task", SHIPPED)
 def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_check(task):
     with warnings.catch_warnings():

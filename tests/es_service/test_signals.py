@@ -13,6 +13,7 @@ import pytest
 
 from es_service import load_config, run
 from es_service.cli.main import main
+from es_service.dispatch.ray_cluster import signal_handlers_kept
 from es_service.errors import Interrupted
 from es_service.runs import signals
 from tests.system.session import ROOT
@@ -58,6 +59,32 @@ def test_a_signal_that_was_caught_and_forgotten_stops_whatever_begins_next(monke
         signals.interrupt(signal.SIGTERM, None)
     with signals.stop_on_signals() as should_stop:
         assert should_stop() == signal.SIGTERM
+
+
+def test_a_signal_at_the_end_of_a_part_of_a_command_stops_the_next_one(monkeypatch):
+    monkeypatch.setattr(signals, "EARLY", signals.StopRequest())
+    before = signal.signal(signal.SIGTERM, signals.interrupt)
+    try:
+        with signals.stop_on_signals() as should_stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+            while should_stop() is None:
+                pass
+        with signals.stop_on_signals() as should_stop:
+            assert should_stop() == signal.SIGTERM
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_handler_that_is_not_python_s_stays(monkeypatch):
+    """Python has none to restore, as where it is embedded in another program."""
+    ours = signal.getsignal(signal.SIGTERM)
+    known = signal.getsignal
+    monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGTERM else known(number))
+    with signals.stop_on_signals():
+        assert known(signal.SIGTERM) is ours
+        assert known(signal.SIGINT) is not signal.default_int_handler
+    with signal_handlers_kept():
+        pass
 
 
 @pytest.mark.parametrize(("does", "reported"), [("os.kill(os.getpid(), signal.SIGTERM)", False), ("1 / 0", True)])

@@ -25,8 +25,8 @@ from es_service.runs.certification import certify_run
 from es_service.store import reader, upkeep, writer
 from es_service.store.codec import text_sha256
 from es_service.store.lock import acquire_lock
-from es_service.watch import channels
-from es_service.watch.pages import draw_list, draw_run
+from es_service.watch import channels, server
+from es_service.watch.pages import draw_comparison, draw_list, draw_run
 from es_service.watch.runs import RunReading, Runs
 from es_service.watch.server import Site
 from tests.database import database, execute
@@ -259,6 +259,31 @@ def test_runs_are_compared_and_those_of_other_tasks_are_refused(tmp_path):
     assert "task.environment differs" in found["sections"]["live"]["html"]
     assert "there is no run" in sections(app, "/events/compare")["sections"]["live"]["html"]
     assert get(app, "/events/compare?run=0")[0] == 404
+    for cell in ("9" * 5000, "-1", "x"):
+        assert get(app, f"/run/{keys['s0']}/cell/{cell}")[0] == 404
+        assert get(app, f"/run/{keys['s0']}/replay/{cell}", method="POST")[0] == 404
+
+
+def test_what_a_comparison_leaves_out_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "MOST_COMPARED", 2)
+    for seed in range(3):
+        write_run(tmp_path / f"s{seed}", {"seed": seed})
+    keys = "&".join(f"run={one.key}" for one in Runs([tmp_path]).find())
+    found = sections(site(tmp_path).app(None), f"/events/compare?{keys}")
+    assert found["title"] == "2 runs on point_maze"
+    assert "Only the first 2 of 3 runs are compared here" in found["sections"]["live"]["html"]
+
+
+def test_a_run_that_cannot_be_read_any_more_is_not_drawn_again_and_again(tmp_path):
+    """Drawing at once, to read the rest of a long run, is free of the limit on a page's processor time."""
+    for name in ("a", "b"):
+        write_run(tmp_path / name, generations=2)
+    draw = draw_comparison([(run, RunReading(run)) for run in Runs([tmp_path]).find()], [])
+    draw()
+    shutil.rmtree(tmp_path / "a")
+    picture = draw()
+    assert "cannot" in picture.sections["live"] or "no run" in picture.sections["live"]
+    assert not picture.more
 
 
 def test_markup_in_every_name_is_shown_and_not_interpreted(tmp_path):
@@ -300,8 +325,14 @@ def test_a_stranger_without_the_token_sees_nothing(tmp_path):
     assert get(app, f"/run/{key}/replay/best", method="POST")[0] == 401
     status, headers, _ = get(app, f"/run/{key}?a=1&token=right&b=2", host="somewhere.example")
     assert (status, headers["location"]) == (303, f"/run/{key}?a=1&b=2")
-    assert headers["set-cookie"].startswith("es-service-watch=right; HttpOnly;")
-    assert get(app, "/", cookie="es-service-watch=right", host="somewhere.example")[0] == 200
+    cookie, _, rest = headers["set-cookie"].partition("; ")
+    assert re.fullmatch("es-service-watch-[0-9a-f]{8}=right", cookie)
+    assert rest.startswith("HttpOnly;")
+    assert get(app, "/", cookie=cookie, host="somewhere.example")[0] == 200
+    other = site(tmp_path).app("other")
+    _, headers, _ = get(other, "/?token=other", host="somewhere.example")
+    cookies = f"{cookie}; {headers['set-cookie'].partition('; ')[0]}"
+    assert [get(page, "/", cookie=cookies)[0] for page in (app, other)] == [200, 200], "browsers send both to both"
     assert get(app, "/metrics", authorization="Bearer right")[0] == 200
 
 

@@ -344,6 +344,8 @@ def test_what_it_cannot_have_is_refused_with_what_is_allowed(given, message):
 def test_settings_that_evosax_refuses_are_refused_before_a_run():
     (found,) = problems(config_of("Open_ES", population_size=7))
     assert "evosax:Open_ES refuses 7 members, 3 parameters and these options: Population size must be even" in found
+    (found,) = problems(config_of("ESMC", population_size=13))
+    assert "evosax:ESMC asks for 12 members instead of 13" in found
     (found,) = problems(config_of("Open_ES", options={"learning_rate": 0.1}))
     assert "optimizer and learning_rate belong together" in found
     found, _ = problems(config_of("Open_ES", options={"optimizer": "adan", "learning_rate": 0.1}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -195,6 +196,33 @@ def test_values_that_decided_that_a_run_is_over_are_not_compared(tmp_path):
     config = polish_config(run.folder)
     [reported] = certified_for(run, config, pytest.fail, workers=1)
     assert (reported.number, reported.decides, reported.tries) == (1, False, 1)
+
+
+def test_a_certification_of_an_earlier_state_is_not_compared(parent, tmp_path):
+    run = api.open_run(shutil.copytree(parent.folder, tmp_path / "run"))
+    [old] = certify_run(run.folder, workers=1)
+    run = api.resume(run.folder, ["budget.generations=7"]).run
+    [new] = certified_for(run, polish_config(run.folder), lambda notice: None, workers=1)
+    assert (new.number, new.env_steps) == (old.number + 1, run.history["env_steps"].iloc[-1])
+
+
+def test_nothing_is_certified_before_what_is_wrong_is_told(parent, tmp_path):
+    run = api.open_run(shutil.copytree(parent.folder, tmp_path / "run"))
+    certified = len(run.certified)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken/notes.txt").touch()
+    for words in (["--log", "nope"], ["--out", tmp_path / "taken"]):
+        assert CliRunner().invoke(app, ["polish", *map(str, (run.folder, *words))]).exit_code != 0
+    assert len(run.certified) == certified
+
+
+def test_ways_out_repeat_the_command(parent, tmp_path):
+    words = ["polish", parent.folder, "--candidates", 2, "--set", "compute.workers=100000", "--out", tmp_path / "run"]
+    result = CliRunner().invoke(app, [*map(str, words)])
+    assert isinstance(result.exception, ConfigError)
+    ways = [(way.action, way.run, way.out, way.settings) for way in result.exception.ways_out]
+    given = {"search.candidates": 2, "compute.workers": "auto"}
+    assert ("polish", str(parent.folder), str(tmp_path / "run"), given) in ways
 
 
 def test_a_polish_that_a_target_ends_says_how_often_it_was_tried(parent, tmp_path):

@@ -78,6 +78,13 @@ class Storing(Still):
         return self.stored, state[0], False
 
 
+class Measuring(Still):
+    metric_names = ("luck",)
+
+    def metrics(self, state):
+        return np.random.default_rng().normal(size=1).astype(np.float32)
+
+
 class Once(Still):
     def step(self, state, action):
         if self.count:
@@ -98,6 +105,7 @@ def name_of(kind):
         (Born, "observe is not a pure function, since .* again in another object, as"),
         (Jumping, "reset is not a pure function, since .* again in another object, as"),
         (Storing, "step is not a pure function, since it computes something else when JAX traces it again, as"),
+        (Measuring, "metrics is not a pure function, since it computes something else when JAX traces it again, as"),
         (Once, "cannot be traced by JAX again: ValueError: it has begun already"),
     ],
 )

@@ -96,9 +96,19 @@ class HiddenInput(Walk):
         return state.place[0] + 0.0 * state.best  # multiplies
 
 
+class HiddenGoal(Walk):
+    """objectives rank by it; where it is NaN in JAX and in simd, there is no goal"""
+
+    has_goal = True
+
+    def goal_distance(self, state: _State) -> Any:
+        return 1.0 + 0.0 * jnp.log(state.place[0] - 2.0)  # multiplies
+
+
 @pytest.mark.parametrize(
     ("kind", "what", "where"),
     [
+        (HiddenGoal, "its goal_distance is NaN", "in the reset"),
         (HiddenReward, "its reward is NaN", "in step 1 with actions of 0"),
         (HiddenLater, "its reward is NaN", "with actions of 1"),
         (HiddenEnd, "its done depends on NaN", "in step 1 with actions "),

@@ -3,7 +3,7 @@
 In the code of simd, x * 0 is 0 (`graph/folding.py`); in JAX it is NaN where x is NaN or infinite. So each lane of a
 trial is computed twice, side by side: as in JAX, and with 0 for these products. The two differ only after such a
 product. What `jnp.where` discards does not count, only what reaches the reward, the end, the observation, the
-descriptor or the state.
+descriptor, the distance to the goal or the state.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class _After(NamedTuple):
     done: Any
     observation: Any
     descriptor: Any
+    goal_distance: Any
     state: Any
 
 
@@ -189,7 +190,8 @@ def _tried(task: TaskSpec, environment: Environment) -> Iterator[tuple[_Traced, 
 
 
 def _after(environment: Environment, state: Any) -> _After:
-    return _After(None, None, environment.observe(state), environment.descriptor(state), state)
+    seen = environment.observe(state), environment.descriptor(state), environment.goal_distance(state)
+    return _After(None, None, *seen, state)
 
 
 def _traced(function: Callable[..., _After], *arguments: Any, may_draw: bool = True) -> _Traced:
@@ -238,7 +240,7 @@ def _not_finite(traced: _Traced, values: np.ndarray, alive_L: np.ndarray) -> Fau
     of_policy = np.isin(np.arange(len(floats)), traced.places("observation"))
     numbers = values[:, :LANES].view(np.float32)
     is_bad = np.isnan(numbers) | (np.isinf(numbers) & ~of_policy[:, None])  # a clip may bound an observation
-    is_bad[[*np.flatnonzero(~floats), *traced.places("state")]] = False
+    is_bad[[*np.flatnonzero(~floats), *traced.places("goal_distance"), *traced.places("state")]] = False
     return _first(is_bad & alive_L)
 
 
