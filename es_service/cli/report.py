@@ -29,6 +29,8 @@ from es_service.protocol.machine import given_path
 if TYPE_CHECKING:
     from es_service.report.data import RunData
 
+DEFAULT_AXIS = "env_steps"
+
 
 def report(
     folders: RunsArgument,
@@ -78,7 +80,7 @@ def report(
             metavar="COLUMN",
             help="Axis of the curves of --figures: env_steps, generation, wall_clock_s, rollout_s or cpu_s.",
         ),
-    ] = "env_steps",
+    ] = DEFAULT_AXIS,
     statistics: Annotated[
         Path | None,
         typer.Option(
@@ -92,6 +94,12 @@ def report(
     """Write a page about a run: its curves, its map, its policies; or one that compares several runs, or a sweep."""
     from es_service.report.write import REPORT, write_report
 
+    ignored = {
+        f"--against {against}": against != DEFAULT_AXIS,
+        f"--metric {(metric or [None])[0]}": metric and statistics is None,
+    }
+    if figures is None and (options := [option for option, is_given in ignored.items() if is_given]):
+        raise ConfigError(f"{options[0]} is for figures; add --figures DIR, or leave it out")
     if not is_single(folders):
         if replay:
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")

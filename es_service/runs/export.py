@@ -96,8 +96,9 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     [O], `best_std` [O], `centre_parameters`, ..., `certified_parameters`, ...; for N elites `cell` [N, dimensions of
     the map], `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters`
     [N, D], `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases,
-    layer after layer; those of a memory are of its gates and its candidate (`workers/policy.py`). If the task
-    is a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
+    layer after layer; those of a memory are of its gates and its candidate (`workers/policy.py`). If actions of -1 and
+    1 stand for other values of the environment, these are `action_low` [A] and `action_high` [A]. If the task is a
+    function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
     snapshot = run.at(named=named_by_all)
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
@@ -109,6 +110,8 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         "memory": np.array(spec.memory),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
+    if bounds := run.meta.task.get("action_bounds"):
+        exported["action_low"], exported["action_high"] = np.array(bounds).T
     policies = {"best": snapshot.policy("best")}
     if snapshot.newest_centre is not None:
         policies["centre"] = snapshot.policy("centre")
@@ -282,6 +285,9 @@ def _npz(run: Run, folder: Path) -> list[Path]:
 
 
 def _onnx(run: Run, folder: Path) -> list[Path]:
+    if run.parameter_spec is not None:
+        what = f"{run.folder} has no policies, since its task is a function; csv and npz have its parameters"
+        raise NotInRunError(what, run=run.folder)
     certified, snapshot = newest_certified(run.folder), run.at(named=named_best)
     policies: dict[str, Policy] = {} if certified is None else {"certified": run.policy("certified")}
     policies["best"] = snapshot.policy("best")

@@ -6,6 +6,7 @@ policy with a memory also takes the memory before the step (zeros at the start o
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -124,6 +125,8 @@ def about(run: Run, certified: Certified | None) -> dict[str, str]:
         "run": run.run_id,
         "generation": str(run.generation),
     }
+    if bounds := run.meta.task.get("action_bounds"):
+        facts["action_low"], facts["action_high"] = (json.dumps(values) for values in zip(*bounds, strict=True))
     if certified is not None:
         row, measure = certified.row(), measure_of(constants["task.fitness"])
         facts["certified"] = "{} ({} to {}) in {} episodes".format(
@@ -148,6 +151,7 @@ def model_card(run: Run, files: Sequence[str], certified: Certified | None) -> s
         f"| method | `{constants['search.algorithm']}`, seed {constants['seed']}, generation {run.generation} |",
         f"| network | {spec.widths[0]} observations to {spec.widths[-1]} actions, {spec.parameters:,} parameters, "
         f"{normal} normalisation of observations (inside the model) |",
+        *_actions(run),
         f"| run | `{run.run_id}` |",
         *(f"| {package} | {version} |" for package, version in sorted(_versions(run).items())),
         "",
@@ -202,6 +206,16 @@ def model_card(run: Run, files: Sequence[str], certified: Certified | None) -> s
         "",
     ]
     return "\n".join(lines)
+
+
+def _actions(run: Run) -> list[str]:
+    """Row of what an action is to the environment, where it is not the model's as it is."""
+    if bounds := run.meta.task.get("action_bounds"):
+        ends = " and ".join(str([*values]) for values in zip(*bounds, strict=True))
+        return [f"| actions | -1 and 1 stand for the environment's {ends}: `low + (action + 1) / 2 * (high - low)` |"]
+    if run.meta.task.get("discrete_actions"):
+        return ["| actions | 1 for the one that is chosen, 0 for the others: the environment's is `action.argmax()` |"]
+    return []
 
 
 def _versions(run: Run) -> dict[str, str]:

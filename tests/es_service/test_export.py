@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import onnxruntime
@@ -11,14 +12,16 @@ import pytest
 
 from es_service import api
 from es_service.config.resolution import policy_spec_of
-from es_service.errors import StoreError
+from es_service.errors import NotInRunError, StoreError
+from es_service.protocol.options import ParameterSpec
 from es_service.runs.certification import certify_run
 from es_service.runs.export import arrays, export, tables
-from es_service.runs.onnx import onnx_model
+from es_service.runs.onnx import about, model_card, onnx_model
 from es_service.runs.snapshot import Policy
 from es_service.store import reader
 from tests.database import execute
 from tests.run_examples import write_run
+from workers.environments import SHIPPED
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 FIRST, LAST = 2, 8
@@ -93,6 +96,26 @@ def test_exported_models_have_a_card_whose_code_runs(run, tmp_path, monkeypatch)
     exec(card.partition("```python\n")[2].partition("```")[0], names)  # as users copy it
     observation = np.zeros((1, run.policy_spec.widths[0]), np.float32)
     np.testing.assert_allclose(names["action"], run.policy("certified")(observation), atol=1e-6)
+
+
+def test_what_actions_stand_for_is_exported(tmp_path):
+    bounded = replace(SHIPPED["point_maze"], action_bounds=((-2.0, 2.0), (0.0, 1.0)))
+    run = api.open_run(write_run(tmp_path / "bounded", task=bounded))
+    row = "| actions | -1 and 1 stand for the environment's [-2.0, 0.0] and [2.0, 1.0]: `low + (action + 1) / 2"
+    assert row in model_card(run, ["best.onnx"], None)
+    assert about(run, None)["action_low"] == "[-2.0, 0.0]"
+    assert (arrays(run)["action_low"].tolist(), arrays(run)["action_high"].tolist()) == ([-2.0, 0.0], [2.0, 1.0])
+    chosen = replace(SHIPPED["point_maze"], discrete_actions=True)
+    run = api.open_run(write_run(tmp_path / "chosen", task=chosen))
+    assert "the environment's is `action.argmax()`" in model_card(run, ["best.onnx"], None)
+    assert "action_low" not in arrays(run)
+
+
+def test_parameters_of_a_function_are_no_policy(tmp_path):
+    named = ParameterSpec(("a", "b"), ((0.0, 1.0), (-1.0, 1.0)), (0.5, 0.0))
+    run = api.open_run(write_run(tmp_path / "run", task=replace(SHIPPED["point_maze"], parameters=named)))
+    with pytest.raises(NotInRunError, match="has no policies, since its task is a function; csv and npz have its"):
+        export(run, "onnx", tmp_path / "out")
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ Sweeps themselves are in `tests/system/test_sweep.py`.
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -216,6 +217,21 @@ def test_options_that_contradict_each_other_are_refused(tmp_path):
         assert isinstance(result.exception, ConfigError)
         assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stop_that_a_run_does_not_reach_leaves_its_budget_at_the_end(tmp_path, monkeypatch):
+    planned = plan(MINIMAL, tmp_path, {}, [0], ["budget.generations=1"])[0]
+    (tmp_path / INSIDE).mkdir()
+    command = command_of(planned, 2, tmp_path / INSIDE, [], Certifying({"env_steps": [1e9]}))
+    stopped = command.next_words()
+    assert stopped[-1] == "--set=budget.env_steps=1000000000"
+    write_run(planned.folder, {"budget.env_steps": 10**9}, generations=1)
+    assert command.next_words() == command.certify
+    monkeypatch.setattr(sweep_commands, "certified_over_time", lambda folder: [sweep_commands.newest(folder)])
+    assert command.next_words() == command.run
+    shutil.rmtree(planned.folder)
+    write_run(planned.folder, generations=1)
+    assert command.next_words() == []
 
 
 def test_a_run_is_certified_at_points_of_cost_and_at_its_end(tmp_path, monkeypatch):

@@ -215,6 +215,8 @@ def test_a_task_that_is_gone_is_reported_without_a_replay(page, tmp_path):
 def test_wrong_replays_are_refused(tmp_path):
     folder = write_run(tmp_path / "run", filled=0.5)
     for options, message in (
+        (["--against", "generation"], "--against generation is for figures; add --figures DIR"),
+        (["--metric", "coverage"], "--metric coverage is for figures; add --figures DIR"),
         (["--replay", "x"], "--replay x: must be whole numbers"),
         (["--replay", "99,99"], "cell 99,99 is not in the map"),
         (["--replay", "none", "--replay", "best"], "cannot be combined"),
