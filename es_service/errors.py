@@ -25,6 +25,11 @@ from es_service.protocol.errors import TaskError as TaskError
 from es_service.protocol.errors import WayOut as WayOut
 
 
+def decimals(value: float, form: str = "z.2f") -> str:
+    """A value with two decimals, or in scientific form where these would show nothing of it: -84.78, 1.30e-05."""
+    return f"{value:.2e}" if 0.0 < abs(value) < 0.01 else f"{value:{form}}"
+
+
 def counted(how_many: int, singular: str, plural: str = "") -> str:
     """A number and a noun, such as "1 worker", "3 workers" or, with a plural of its own, "2 policies"."""
     return f"{how_many:,} {singular if how_many == 1 else plural or f'{singular}s'}"

@@ -32,9 +32,10 @@ from es_service.cli.common import (
     print_note,
     readable,
 )
-from es_service.errors import ConfigError, StoreError
+from es_service.errors import ConfigError, StoreError, decimals
 from es_service.protocol.machine import given_path
 from es_service.report.progress import print_notice
+from es_service.report.summary import qd_score
 from es_service.runs.evaluation import Fresh
 from es_service.runs.view import Run
 
@@ -248,7 +249,8 @@ def print_header(console: Console, run_width: int | None = None) -> None:
 def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_width: int | None = None) -> None:
     """Print the line of a policy, of which `names` are the descriptor's dimensions."""
     run = "" if run_width is None else f"{row['run']:<{run_width}}  "
-    values = f"{row['stored_fitness']:>z10.2f} {row['fresh_fitness']:>z10.2f} {row['fresh_standard_error']:>8.2f}"
+    values = f"{decimals(row['stored_fitness']):>10} {decimals(row['fresh_fitness']):>10} "
+    values += f"{decimals(row['fresh_standard_error']):>8}"
     success = "-" if row["successes"] is None else f"{row['successes']}/{row['episodes']}"
     where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
     print_line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values} {success:>11}  {where}")
@@ -290,7 +292,7 @@ def print_map_summary(console: Console, run: Run, results: list[Fresh]) -> None:
         console,
         f"{len(elites)} elites: the mean descriptor of {stayed} still lies in their cell; a new map built from the "
         f"fresh values has {len(best)} filled cells.\n"
-        f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh",
+        f"QD-score (offset {offset:g}): {qd_score(stored)} stored, {qd_score(again)} fresh",
     )
 
 

@@ -25,11 +25,11 @@ from es_service.cli.common import (
     settings,
     way_command,
 )
-from es_service.errors import ConfigError, ServiceError, StoreError, counted
+from es_service.errors import ConfigError, ServiceError, StoreError, counted, decimals
 from es_service.loop.history import evaluated_nouns
 from es_service.protocol.machine import given_path
 from es_service.report.progress import plain_line, short
-from es_service.report.summary import number
+from es_service.report.summary import number, qd_score
 from es_service.runs.certified import (
     Certified,
     certified_elsewhere,
@@ -134,14 +134,13 @@ def _progress(status: RunStatus) -> dict[str, str]:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, minimum {last['goal_distance_min']:.3f}"
     filled = {}
     if "map_cells" in last:
-        filled["map"] = (
-            f"{counted(last['map_cells'], 'cell')}, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
-        )
+        score = qd_score(last["qd_score"])
+        filled["map"] = f"{counted(last['map_cells'], 'cell')}, {100 * last['coverage']:.1f} %; QD-score {score}"
         offset = status.run.constants["map.qd_offset"]
         if last["qd_score"] < 0.0 or last["centre_fitness_mean"] < offset:
             filled["map"] += f", which elites below map.qd_offset = {offset:g} lower"
     nouns, episodes = evaluated_nouns(last), status.run.constants["search.evaluation_episodes"]
-    spread = f" ± {last['centre_fitness_std']:.2f}" if episodes > 1 else ""  # that of one episode is not known
+    spread = f" ± {decimals(last['centre_fitness_std'])}" if episodes > 1 else ""  # that of one episode is not known
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     recent = read_recent(status.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
@@ -151,9 +150,9 @@ def _progress(status: RunStatus) -> dict[str, str]:
         target += f" (certified target: {status.target_certified:g})"
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
-        "best fitness": f"{last['best_fitness']:z.2f}{target}; selected, not certified",
+        "best fitness": f"{decimals(last['best_fitness'])}{target}; selected, not certified",
         **({"certified target": failed_sentence(status.tries)} if status.tries else {}),
-        f"{nouns[0]} fitness": f"{last['centre_fitness_mean']:z.2f}{spread}",
+        f"{nouns[0]} fitness": f"{decimals(last['centre_fitness_mean'])}{spread}",
         **goal,
         **filled,
         "novelty archive": counted(last["archive_size"], *nouns),
@@ -277,7 +276,8 @@ def _signed(value: float) -> str:
 
 def _interval(row: Mapping[str, Any], name: str) -> str:
     mean, low, high = (row[f"{name}_{end}"] for end in ("mean", "low", "high"))
-    return f"{mean:z,.2f} [{low:z,.2f}, {high:z,.2f}]"
+    mean, low, high = (decimals(value, "z,.2f") for value in (mean, low, high))
+    return f"{mean} [{low}, {high}]"
 
 
 # The command, and the line of each of several runs.
@@ -406,7 +406,7 @@ def _row(status: RunStatus) -> tuple[str, ...]:
         *who,
         f"{row['generation']:,}" + (f" of {generations:,}" if generations else ""),
         short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
-        f"{row['best_fitness']:z.2f}",
+        decimals(row["best_fitness"]),
         f"{row['map_cells']:,}" if "map_cells" in row else "-",
         state(status),
     )

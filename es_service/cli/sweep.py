@@ -43,7 +43,7 @@ from es_service.cli.common import (
 )
 from es_service.config.given import parse_overrides
 from es_service.config.text import split_values, unknown_name
-from es_service.errors import ConfigError, Interrupted, Problem, counted
+from es_service.errors import ConfigError, Interrupted, Problem, counted, decimals
 from es_service.protocol.machine import given_path
 from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import COSTS, Certifying, OnProgress, SweptRun, run_planned
@@ -401,7 +401,7 @@ def live_table(title: str, runs: Sequence[SweptRun], width: int, height: int) ->
         "run": lambda run: run.name,
         "state": lambda run: run.state,
         "generation": lambda run: _of(run, "generation", "generations"),
-        "best": lambda run: f"{run.row['best_fitness']:z.2f}" if run.row else "-",
+        "best": lambda run: decimals(run.row["best_fitness"]) if run.row else "-",
         "env steps": lambda run: _of(run, "env_steps", "env_steps"),
         "steps/s": lambda run: short(run.row["steps_per_second"]) if run.row and run.state == "running" else "-",
         "cells": lambda run: str(run.row["map_cells"]) if run.row and "map_cells" in run.row else "-",

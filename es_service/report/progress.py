@@ -18,6 +18,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from es_service.errors import decimals
 from es_service.loop.history import Row, evaluated_word
 
 ShowRow = Callable[[Row], None]
@@ -93,7 +94,7 @@ def print_notice(console: Console, notice: str) -> None:
 
 def _spread(std: float) -> str:
     """The spread of a mean; empty for 0, that of a single episode or of equal ones."""
-    return f" ± {std:.2f}" if std else ""
+    return f" ± {decimals(std)}" if std else ""
 
 
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
@@ -101,8 +102,8 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
     evaluated = f"{evaluated_word(recent[-1])} fitness"
     columns: dict[str, Callable[[Row], str]] = {
         "generation": lambda row: str(row["generation"]),
-        evaluated: lambda row: f"{row['centre_fitness_mean']:z.2f}" + _spread(row["centre_fitness_std"]),
-        "best so far": lambda row: f"{row['best_fitness']:z.2f}",
+        evaluated: lambda row: decimals(row["centre_fitness_mean"]) + _spread(row["centre_fitness_std"]),
+        "best so far": lambda row: decimals(row["best_fitness"]),
         "env steps": lambda row: short(row["env_steps"]),
         "steps/s": lambda row: short(row["steps_per_second"]),
         "population median": lambda row: _number(row["population_fitness_median"]),
@@ -132,8 +133,8 @@ def time_by_part(rows: deque[Row] | list[Row]) -> str:
 
 def plain_line(row: Row) -> str:
     return (
-        f"generation {row['generation']}  {evaluated_word(row)} {row['centre_fitness_mean']:z.2f}  "
-        f"best {row['best_fitness']:z.2f}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
+        f"generation {row['generation']}  {evaluated_word(row)} {decimals(row['centre_fitness_mean'])}  "
+        f"best {decimals(row['best_fitness'])}  env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
     )
 
 
@@ -153,7 +154,7 @@ def _plain_lines(console: Console) -> ShowRow:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:z.2f}"
+    return "-" if value is None else decimals(value)
 
 
 def short(value: float) -> str:

@@ -221,6 +221,11 @@ def number(value: float) -> str:
     return f"{value:.{1 if size >= 100 else 2 if size >= 1 else 3}f}"
 
 
+def qd_score(value: float) -> str:
+    """A QD-score in whole numbers, or as `number` if it is small."""
+    return number(value) if 0.0 < abs(value) < 10.0 else f"{value:z,.0f}"
+
+
 def duration(seconds: float) -> str:
     """A duration, such as 34.5 s, 12 min 3 s or 5 h 20 min."""
     if not math.isfinite(seconds):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import create_model
 
 from es_service.config.text import show
-from es_service.errors import StoreError
+from es_service.errors import StoreError, decimals
 from es_service.loop.forms import BOOL, INTEGER, POLICY, REAL, array_problem
 from es_service.protocol.content import OF_POLICY, Policy, names, policy_of
 from es_service.protocol.noise import Domain, seed_for
@@ -296,7 +296,7 @@ def failed_sentence(means: Sequence[float]) -> str:
     """What `failed_tries` returns in words, such as "2 tries, none held: -127.03, -127.06"; empty if it is empty."""
     if not means:
         return ""
-    shown = ", ".join(f"{mean:z.2f}" for mean in means[-SHOWN_TRIES:])
+    shown = ", ".join(decimals(mean) for mean in means[-SHOWN_TRIES:])
     newest = f" (the newest {SHOWN_TRIES})" if len(means) > SHOWN_TRIES else ""
     return f"1 try, did not hold: {shown}" if len(means) == 1 else f"{len(means):,} tries, none held: {shown}{newest}"
 

@@ -2,10 +2,12 @@
 
 import io
 from collections import deque
+from math import nan
 
 import pytest
 from rich.console import Console
 
+from es_service.errors import decimals
 from es_service.report.progress import live_table, plain_line, short, show_progress
 
 ROW = {
@@ -81,3 +83,12 @@ def test_the_spread_of_one_episode_is_not_shown(std, shown):
 def test_counts_have_three_digits_at_the_borders_of_units_too():
     counts = {999.4: "999", 999.7: "1 k", 12_345: "12.3 k", 999_499: "999 k", 999_500: "1 M", 1.2345e12: "1.23 T"}
     assert {count: short(count) for count in counts} == counts
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-84.784, "-84.78"), (-1234.5, "-1234.50"), (-0.0, "0.00"), (0.01, "0.01"), (0.0026, "2.60e-03"), (nan, "nan")],
+)
+def test_a_small_value_is_not_shown_as_0(value, text):
+    assert decimals(value) == text
+    assert f"best {text}  env" in plain_line(ROW | {"best_fitness": value})
