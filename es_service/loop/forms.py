@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from es_service.loop.blocks import ARCHIVE, BEST, BLOCK, CENTRES, COUNTS, EXTRA, GEOMETRY, MAP, OBSERVATIONS, WEIGHT
-from es_service.protocol.content import OF_POLICY
+from es_service.protocol.content import NO_NAME, OF_POLICY
 
 INTEGER, REAL, BOOL, NAMES = "iu", "f", "b", "V"
 """Kinds of a `dtype`."""
@@ -137,9 +137,19 @@ def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes
         for name, array in counts.items():
             if not ((array >= 0) & (array < 2**53)).all():
                 return f"has an array {name!r} that counts {array}"
+    if kind == BEST and arrays["policy"].tobytes() == NO_NAME:
+        return "names no policy"
+    if kind == OBSERVATIONS and not (np.abs([arrays["mean_O"], _root(arrays)]) <= np.finfo(np.float32).max).all():
+        return "has statistics that no observations have"
     if kind == WEIGHT and not 0.0 <= arrays["value"] <= 1.0:
         return f"has the value {arrays['value']}; must be from 0 to 1"
     return ""
+
+
+def _root(observations: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Standard deviation of observations, by their statistics; NaN if these are none."""
+    with np.errstate(all="ignore"):
+        return np.sqrt(observations["m2_O"] / np.maximum(observations["count"], 1.0))
 
 
 def _problem_of_geometry(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:

@@ -105,7 +105,7 @@ def _sentence(groups: Sequence[Group], threshold: float | None, *, paired: bool)
             if len(others) > 1:
                 whose = "the greatest corrected p of its differences from the others"
             sentence += f"; {whose} is {between.p_text(p)}"
-    if column == CERTIFIED:
+    if column == CERTIFIED and "best_fitness" in best.values:
         sentence += f"; the median of its selected best fitness is {number(best.values['best_fitness'].median)}"
     if threshold is not None:
         solved = sum(summary.solved for summary in summaries)

@@ -139,7 +139,8 @@ def with_derived(history: HistoryColumns, certified: Sequence[Mapping[str, Any]]
             column_G = derived.setdefault(name, np.full(steps_G.size, np.nan))
             column_G[steps_G >= since] = number
     if CERTIFIED in derived:
-        derived[GAP] = history["best_fitness"] - derived[CERTIFIED]
+        with np.errstate(invalid="ignore"):  # both may be -inf
+            derived[GAP] = history["best_fitness"] - derived[CERTIFIED]
     return {**history, **derived}
 
 

@@ -225,7 +225,7 @@ def certified_by_task(folder: Path) -> dict[str, CertifiedValue]:
     values: dict[str, CertifiedValue] = {}
     if (newest := newest_certified(folder)) is not None:
         meta = read_meta(folder)
-        settings, declared = meta.config["task"], meta.task["options"]
+        settings, declared = meta.config["task"], meta.task.get("options", {})
         changed = {
             name: value
             for name, value in settings["options"].items()

@@ -145,6 +145,10 @@ def _payload(payload: bytes, rng: random.Random) -> tuple[bytes, str]:
     arrays = decode_part(payload)
     name = rng.choice(sorted(arrays))
     kind = rng.choice(("values", "values", "one value", "type", "shape", "missing", "renamed", "header", "header"))
+    if arrays[name].dtype.kind == "V" and kind in ("values", "one value", "type"):  # names of policies
+        text = rng.randbytes(arrays[name].nbytes) if rng.random() < 0.5 else bytes(arrays[name].nbytes)
+        arrays[name] = np.frombuffer(text, "<i8" if kind == "type" else arrays[name].dtype)
+        return encode_part(arrays), f"{kind} of {name}"
     match kind:
         case "values":
             arrays[name] = np.full(arrays[name].shape, rng.choice(NUMBERS)).astype(arrays[name].dtype)

@@ -17,6 +17,7 @@ from es_service.config.model import RunConfig
 from es_service.config.parts import Objective
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.sections import NoveltyConfig
+from es_service.errors import StoreError
 from es_service.protocol.content import Policy
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.nearest import NOVELTY
@@ -167,12 +168,17 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
 
 
 def step_centre(state: SearchState, asked: Ask, gradient_D: FloatArray, search: PopulationConfig) -> SearchState:
-    """The state after one step of the asked centre up the gradient estimate [D], by its own `search.step`."""
+    """The state after one step of the asked centre up the gradient estimate [D], by its own `search.step`. Raises
+    StoreError if the centre lacks what the step remembers, as in a run that somebody else has written."""
     centre = state.centres[asked.centre]
     settings = search.step
     if asked.rate != 1.0:
         settings = settings.model_copy(update={"learning_rate": settings.learning_rate * asked.rate})
-    step, centre_D = STEPS[settings.kind].take(settings, centre.step, centre.centre_D, gradient_D)
+    try:
+        step, centre_D = STEPS[settings.kind].take(settings, centre.step, centre.centre_D, gradient_D)
+    except KeyError as error:
+        what = f"centre {asked.centre} lacks {error}, which a step of search.step.kind = {settings.kind} remembers"
+        raise StoreError(what) from error
     return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, step=step))
 
 
