@@ -139,17 +139,18 @@ def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes
                 return f"has an array {name!r} that counts {array}"
     if kind == BEST and arrays["policy"].tobytes() == NO_NAME:
         return "names no policy"
-    if kind == OBSERVATIONS and not (np.abs([arrays["mean_O"], _root(arrays)]) <= np.finfo(np.float32).max).all():
-        return "has statistics that no observations have"
+    if kind == OBSERVATIONS and _overflows(arrays["mean_O"], arrays["m2_O"], arrays["count"]):
+        return "has statistics that float32 cannot hold"
     if kind == WEIGHT and not 0.0 <= arrays["value"] <= 1.0:
         return f"has the value {arrays['value']}; must be from 0 to 1"
     return ""
 
 
-def _root(observations: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Standard deviation of observations, by their statistics; NaN if these are none."""
+def _overflows(mean_O: np.ndarray, m2_O: np.ndarray, count: np.ndarray) -> bool:
+    """Whether finite statistics of observations, which are float32, have a mean or a standard deviation that is not."""
     with np.errstate(all="ignore"):
-        return np.sqrt(observations["m2_O"] / np.maximum(observations["count"], 1.0))
+        values = np.abs([mean_O, np.sqrt(m2_O / np.maximum(count, 1.0))])
+    return bool((np.isfinite(values) & (values > np.finfo(np.float32).max)).any())
 
 
 def _problem_of_geometry(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:
