@@ -12,24 +12,28 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from es_service import api
+from es_service import api, load_config
 from es_service.cli.main import app
-from es_service.errors import ConfigError, ServiceError
+from es_service.errors import ConfigError, ServiceError, StoreError
 from es_service.loop.blocks import BEST, OBSERVATIONS
 from es_service.loop.forms import Sizes, problem
 from es_service.protocol.content import NAME
 from es_service.report.data import read_run
+from es_service.report.measures import GAP, with_derived
 from es_service.report.page import run_page
 from es_service.runs.certification import certify_run
 from es_service.runs.evaluation import candidates
 from es_service.runs.lineage import started
 from es_service.runs.verification import verify
+from es_service.search.algorithms.base import Ask
+from es_service.search.algorithms.common import first_state, step_centre
 from es_service.watch.pages import draw_comparison, draw_list, draw_run, metrics
 from es_service.watch.runs import RunReading, Runs
 from tests.es_service.forgeries import forge
@@ -189,6 +193,24 @@ SIZES = Sizes(parameters=4, observation=2, dimensions=2, cells=None, bounds=())
 def test_values_that_no_state_has_are_named(name, arrays, what):
     found = problem(name, {key: np.asarray(value) for key, value in arrays.items()}, SIZES)
     assert found.startswith(f"{name} {what}") if what else not found
+
+
+def test_a_centre_without_the_moments_of_its_step_is_refused():
+    config = load_config(
+        {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+    )
+    zeros_D = np.zeros(3, np.float32)
+    state = first_state([zeros_D], 2, 1.0)
+    bare = replace(state, centres=(replace(state.centres[0], step={}),))
+    with pytest.raises(StoreError, match=r"centre 0 lacks 'adam_step', which a step of search\.step\.kind = adam rem"):
+        step_centre(bare, Ask(0, zeros_D, 0.1, 16, 1.0), zeros_D, config.search)
+
+
+def test_the_gap_of_a_best_fitness_that_is_infinite_is_unknown():
+    """Both may be -inf, of a function that calls each point infeasible."""
+    history = {"env_steps": np.array([1.0, 2.0]), "best_fitness": np.full(2, -np.inf)}
+    row = {"env_steps": 2, "return_mean": -np.inf, "successes": None, "episodes": 4}
+    assert np.isnan(with_derived(history, [row], "sum")[GAP]).all()
 
 
 @pytest.mark.slow
