@@ -73,7 +73,7 @@ def print_status(console: Console, run: Run) -> None:
         "task": f"{constants['task.environment']}, {counted(constants['task.episode_steps'], 'step')} an episode",
         "search": ", ".join(filter(None, [*method, f"seed {constants['seed']}"])),
     }
-    if where := run.meta.task.get("does_not_repeat"):
+    if where := run.task.does_not_repeat:
         fields["not repeatable"] = f"the task returns other numbers for the same seed {where}"
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
@@ -166,7 +166,7 @@ def _progress(status: RunStatus) -> dict[str, str]:
 def _parameters(status: RunStatus) -> dict[str, str]:
     """The parameters of the best centre by name, if the task is a function."""
     run = status.run
-    if status.row is None or run.parameter_spec is None:
+    if status.row is None or run.task.parameters is None:
         return {}
     try:
         named = run.parameters("best")

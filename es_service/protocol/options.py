@@ -154,12 +154,6 @@ class ParameterSpec(NamedTuple):
     start: tuple[float, ...]
     """Where a search starts, in the units of the function."""
 
-    @staticmethod
-    def from_fields(names: Any, bounds: Any, start: Any) -> ParameterSpec:
-        """The parameters from their fields as JSON has them."""
-        pairs = tuple((float(low), float(high)) for low, high in bounds)
-        return ParameterSpec(tuple(names), pairs, tuple(map(float, start)))
-
     def named(self, searched: Any) -> dict[str, float]:
         """Parameters of what a search moves, [D], by name."""
         return dict(zip(self.names, self.values(searched).tolist(), strict=True))

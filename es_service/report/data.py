@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.tasks import task_from_fields
 from es_service.errors import StoreError
 from es_service.loop.blocks import BEST, MAP, joined, value_of
 from es_service.loop.forms import problem
@@ -26,7 +25,7 @@ from es_service.report.measures import as_compared, with_derived
 from es_service.report.series import IN_EVERY_RUN, HistoryColumns
 from es_service.runs.certified import Certified, certified_elsewhere, certified_over_time, newest_certified
 from es_service.runs.run_status import RunStatus, group_of, status_at
-from es_service.runs.snapshot import sizes_of, sound_meta
+from es_service.runs.snapshot import sizes_of, sound_meta, stored_task
 from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.lock import lock_holder
@@ -87,7 +86,7 @@ class RunData:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(self.meta.task["descriptor_names"])
+        return self.task.descriptor_names
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
@@ -144,7 +143,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     history = _floats(found.history)
     if lacking := [column for column in IN_EVERY_RUN if not np.isfinite(history[column]).all()]:
         raise StoreError(f"{folder} is not what es-service writes: a generation has no {lacking[0]}", run=folder)
-    best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
+    best, task = found.parts.get(BEST), stored_task(found.meta)
     certified, elsewhere, over_time = _certified(folder, problems)
     spec, content = task.parameters, {} if best is None else found.contents.get(best["policy"].tobytes(), {})
     point_D = content.get("parameters_D")
@@ -180,7 +179,7 @@ def _is_shown(part: str) -> bool:
 
 def _named(meta: RunMeta, parts: dict[str, Arrays], *, paths: bool) -> list[bytes]:
     """Names of the point of a function, and with `paths` of those of the elites."""
-    best, has_point = parts.get(BEST), meta.task.get("parameters") is not None
+    best, has_point = parts.get(BEST), stored_task(meta).parameters is not None
     traces = [name for block in parts.values() if "trace_N" in block for name in as_bytes(block["trace_N"])]
     return [*([best["policy"].tobytes()] if best is not None and has_point else []), *(traces if paths else [])]
 

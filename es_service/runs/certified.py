@@ -29,7 +29,7 @@ from es_service.runs.selection import (
     interval_columns,
     share_gap_interval,
 )
-from es_service.runs.snapshot import sizes_of, stored_policy_spec
+from es_service.runs.snapshot import sizes_of, stored_policy_spec, stored_task
 from es_service.store.facts import Damaged, Form, require_form
 from es_service.store.reader import read_certifications, read_meta
 from es_service.store.records import CertifiedRow
@@ -225,11 +225,11 @@ def certified_by_task(folder: Path) -> dict[str, CertifiedValue]:
     values: dict[str, CertifiedValue] = {}
     if (newest := newest_certified(folder)) is not None:
         meta = read_meta(folder)
-        settings, declared = meta.config["task"], meta.task.get("options", {})
+        settings, declared = meta.config["task"], stored_task(meta).options
         changed = {
             name: value
             for name, value in settings["options"].items()
-            if name not in declared or value != declared[name]["default"]
+            if name not in declared or value != declared[name].default
         }
         values[task_title(settings["environment"], changed)] = CertifiedValue(newest, newest.episodes)
     for title, policy in certified_elsewhere(folder).items():

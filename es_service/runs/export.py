@@ -72,14 +72,14 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
 
     The parameters are those of the best centre, of the newest one (if the generation evaluated one) and of the elites:
     `which` is best, centre or the place of a cell, such as 3,17; then each parameter in the units of the function."""
-    snapshot = run.at(named=(lambda snapshot: ()) if run.parameter_spec is None else named_by_all)
+    snapshot = run.at(named=(lambda snapshot: ()) if run.task.parameters is None else named_by_all)
     yield "history", run.history_until(snapshot.generation).reset_index()
     yield "evaluations", run.evaluations_until(snapshot.generation)
     yield "novelty", snapshot.novelty
     if run.constants["map.enabled"]:
         yield "map", snapshot.map
-    if run.parameter_spec is not None:
-        yield "parameters", _parameters(snapshot, run.parameter_spec, has_map=run.constants["map.enabled"])
+    if run.task.parameters is not None:
+        yield "parameters", _parameters(snapshot, run.task.parameters, has_map=run.constants["map.enabled"])
     if not (certified := run.certified).empty:
         yield "certified", certified
     if not (decisions := run.decisions).empty:
@@ -110,7 +110,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         "memory": np.array(spec.memory),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
-    if bounds := run.meta.task.get("action_bounds"):
+    if bounds := run.task.action_bounds:
         exported["action_low"], exported["action_high"] = np.array(bounds).T
     policies = {"best": snapshot.policy("best")}
     if snapshot.newest_centre is not None:
@@ -126,7 +126,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     if run.constants["map.enabled"]:
         map_, elites = snapshot.elites()
         exported |= _map_arrays(run, map_, elites)
-    if (named := run.parameter_spec) is not None:
+    if (named := run.task.parameters) is not None:
         exported["parameter_names"] = np.array(named.names)
         of = [name.removesuffix("parameters") for name in exported if name.endswith("parameters")]
         exported |= {f"{prefix}values": named.values(exported[f"{prefix}parameters"]) for prefix in of}
@@ -285,7 +285,7 @@ def _npz(run: Run, folder: Path) -> list[Path]:
 
 
 def _onnx(run: Run, folder: Path) -> list[Path]:
-    if run.parameter_spec is not None:
+    if run.task.parameters is not None:
         what = f"{run.folder} has no policies, since its task is a function; csv and npz have its parameters"
         raise NotInRunError(what, run=run.folder)
     certified, snapshot = newest_certified(run.folder), run.at(named=named_best)

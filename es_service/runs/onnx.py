@@ -125,7 +125,7 @@ def about(run: Run, certified: Certified | None) -> dict[str, str]:
         "run": run.run_id,
         "generation": str(run.generation),
     }
-    if bounds := run.meta.task.get("action_bounds"):
+    if bounds := run.task.action_bounds:
         facts["action_low"], facts["action_high"] = (json.dumps(values) for values in zip(*bounds, strict=True))
     if certified is not None:
         row, measure = certified.row(), measure_of(constants["task.fitness"])
@@ -210,10 +210,10 @@ def model_card(run: Run, files: Sequence[str], certified: Certified | None) -> s
 
 def _actions(run: Run) -> list[str]:
     """Row of what an action is to the environment, where it is not the model's as it is."""
-    if bounds := run.meta.task.get("action_bounds"):
+    if bounds := run.task.action_bounds:
         ends = " and ".join(str([*values]) for values in zip(*bounds, strict=True))
         return [f"| actions | -1 and 1 stand for the environment's {ends}: `low + (action + 1) / 2 * (high - low)` |"]
-    if run.meta.task.get("discrete_actions"):
+    if run.task.discrete_actions:
         return ["| actions | 1 for the one that is chosen, 0 for the others: the environment's is `action.argmax()` |"]
     return []
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.resolution import policy_spec_of
+from es_service.config.tasks import task_from_fields
 from es_service.errors import NotInRunError, StoreError
 from es_service.loop.blocks import ARCHIVE, BEST, MAP, OBSERVATIONS, Tree, centre_path, joined, value_of
 from es_service.loop.contents import stored_elite, stored_policy
@@ -19,7 +20,7 @@ from es_service.loop.forms import INTEGER, REAL, Sizes, missing, policy_problem,
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol import content
 from es_service.protocol.content import Arrays, Contents, as_bytes
-from es_service.protocol.messages import FloatArray, Moments, PolicySpec
+from es_service.protocol.messages import FloatArray, Moments, PolicySpec, TaskSpec
 from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
@@ -50,24 +51,29 @@ OF_CENTRES = {"centre": "INTEGER", "fitness_weight": "REAL", "fitness_mean": "RE
 """The same for the evaluated centres."""
 
 
+def stored_task(meta: RunMeta) -> TaskSpec:
+    """The task of a run as it was when the run was created; what its version did not record has its default."""
+    return task_from_fields(meta.task)
+
+
 def stored_policy_spec(meta: RunMeta) -> PolicySpec:
     """What a run's policies are."""
-    task = meta.task
-    is_ranked = task.get("ranked_actions", False)  # which older versions did not record
-    return policy_spec_of(meta.constants, task["observation_size"], task["action_size"], is_ranked=is_ranked)
+    task = stored_task(meta)
+    return policy_spec_of(meta.constants, task.observation_size, task.action_size, is_ranked=task.ranked_actions)
 
 
 def sizes_of(meta: RunMeta) -> Sizes:
-    dimensions, has_map = len(meta.task["descriptor_names"]), meta.constants["map.enabled"]
+    task, has_map = stored_task(meta), meta.constants["map.enabled"]
     cells = tuple(meta.constants["map.cells"] or ()) if has_map else None
     bounds = tuple((low, high) for low, high in meta.constants["map.bounds"] or ()) if has_map else ()
     step, kinds = STEPS.get(meta.constants.get("search.step.kind") or ""), {"i": INTEGER, "f": REAL}
     of_step = {} if step is None else {name: kinds[array.dtype.kind] for name, array in step.fresh(1).items()}
-    parameters, observation = stored_policy_spec(meta).parameters, meta.task["observation_size"]
+    parameters = stored_policy_spec(meta).parameters
     dominated = {}
     if has_map and meta.constants.get("map.kind") == "dominated":
         dominated = {name: meta.constants[f"map.{name}"] for name in ("slots", "neighbours")}
-    return Sizes(parameters, observation, dimensions, cells, bounds, of_step, dominated)
+    dimensions = len(task.descriptor_names)
+    return Sizes(parameters, task.observation_size, dimensions, cells, bounds, of_step, dominated)
 
 
 def sound_meta(folder: Path, meta: RunMeta) -> RunMeta:
@@ -195,7 +201,7 @@ class Snapshot:
         """The novelty archive; see `Run.novelty`."""
         import pandas as pd
 
-        names = descriptor_names(self.meta)
+        names = stored_task(self.meta).descriptor_names
         archive = self.archive
         columns = {"generation": archive.generation_N, "centre": archive.centre_N}
         return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
@@ -219,7 +225,7 @@ class Snapshot:
         """The behaviour map as a table; see `Run.map`."""
         import pandas as pd
 
-        map_, names = self.behaviour_map, descriptor_names(self.meta)
+        map_, names = self.behaviour_map, stored_task(self.meta).descriptor_names
         labels = [f"cell_{name}" for name in names]
         return pd.DataFrame(
             {"cell": map_.cell_N}
@@ -328,11 +334,6 @@ def map_names(map_: BehaviourMap, cells: Collection[int]) -> list[bytes]:
         raise KeyError(empty[0])
     both = zip(as_bytes(map_.policy_N[rows]), as_bytes(map_.trace_N[rows]), strict=True)
     return [name for names in both for name in names]
-
-
-def descriptor_names(meta: RunMeta) -> list[str]:
-    """Names of a run's descriptor dimensions, in order."""
-    return list(meta.task["descriptor_names"])
 
 
 def map_places(map_: BehaviourMap) -> NDArray[np.int64]:

@@ -291,7 +291,7 @@ def why_not_repeatable(run: Run, config: RunConfig) -> str:
 
     Empty if it repeats itself, as far as can be found, and for tasks in JAX.
     """
-    return run.meta.task.get("does_not_repeat") or why_task_does_not_repeat(config)
+    return run.task.does_not_repeat or why_task_does_not_repeat(config)
 
 
 def why_task_does_not_repeat(config: RunConfig) -> str:

@@ -16,8 +16,7 @@ from es_service.config.text import read_yaml_file
 from es_service.errors import ConfigError, NotInRunError, WayOut
 from es_service.loop.blocks import ARCHIVE, BEST, CENTRES, MAP, OBSERVATIONS, Tree, names_of
 from es_service.protocol.machine import given_path
-from es_service.protocol.messages import PolicySpec
-from es_service.protocol.options import ParameterSpec
+from es_service.protocol.messages import PolicySpec, TaskSpec
 from es_service.runs.certified import (
     all_certifications,
     certified_by_task,
@@ -29,12 +28,12 @@ from es_service.runs.snapshot import (
     Policy,
     Snapshot,
     acting,
-    descriptor_names,
     map_names,
     sound_contents,
     sound_meta,
     sound_nodes,
     stored_policy_spec,
+    stored_task,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
@@ -61,6 +60,11 @@ class Run:
     def meta(self) -> RunMeta:
         """The data that were fixed when the run was created."""
         return sound_meta(self.folder, reader.read_meta(self.folder))
+
+    @property
+    def task(self) -> TaskSpec:
+        """The task, as it was when the run was created."""
+        return stored_task(self.meta)
 
     @property
     def run_id(self) -> str:
@@ -253,7 +257,7 @@ class Run:
 
     @property
     def descriptor_names(self) -> list[str]:
-        return descriptor_names(self.meta)
+        return list(self.task.descriptor_names)
 
     @property
     def generation(self) -> int | None:
@@ -319,18 +323,12 @@ class Run:
 
         Raises as `policy`, and NotInRunError if the task is no function.
         """
-        if (spec := self.parameter_spec) is None:
+        if (spec := self.task.parameters) is None:
             raise NotInRunError(
-                f"{self.folder} has policies: its task {self.meta.task['name']} is no function of parameters",
+                f"{self.folder} has policies: its task {self.task.name} is no function of parameters",
                 run=self.folder,
             )
         return spec.named(self.policy(which).parameters_D)
-
-    @property
-    def parameter_spec(self) -> ParameterSpec | None:
-        """Names, bounds and start of the parameters of the function that is the run's task; None for other tasks."""
-        fields = self.meta.task.get("parameters")
-        return None if fields is None else ParameterSpec.from_fields(*fields)
 
 
 def _frame(columns: Columns) -> pd.DataFrame:
