@@ -212,8 +212,9 @@ def scaling(
         for row in rows:
             print_json_line(row)
         return
-    print(SCALING_HEADER)
-    for row in rows:
+    for number, row in enumerate(rows):
+        if not number:
+            print(SCALING_HEADER)
         print(
             f"{row['workers']:>8}{row['seconds_per_generation']:>14.4g}{row['steps_per_second']:>16,}"
             f"{row['efficiency']:>12.0%}  {row['limit']}",

@@ -49,6 +49,7 @@ from es_service.protocol.nearest import NOVELTY
 from es_service.protocol.policies import ALL_TOGETHER, Policies, Recipes
 from es_service.protocol.sent import Received
 from es_service.runs.checked_config import columns
+from es_service.runs.engine import dispatch_limits
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState
 from es_service.search.novelty import archive_of, extended
@@ -96,7 +97,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     centres = _initial_centres(config, spec)
     works = [_work(phase, centres, spec, config) for phase in phases]
     initial = [(replace(centres[0], archive=None), chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
-    chunk_s, answers = _chunk_costs(spec, [*works, initial])
+    chunk_s, answers = _chunk_costs(spec, [*works, initial], replace(dispatch_limits(config), workers=1))
     message_s, way_s, chunk_message_s = message_costs(spec, works, answers)
     costs = Costs(chunk_s, message_s, way_s, *_driver_cost(config, answers), chunk_message_s)
     steps = _steps(search, answers)
@@ -194,11 +195,13 @@ def _kind(work: Work) -> str:
     return type(work[1]).__name__
 
 
-def _chunk_costs(spec: WorkerSpec, works: Sequence[Sequence[Work]]) -> tuple[dict[str, float], dict[str, ChunkResult]]:
+def _chunk_costs(
+    spec: WorkerSpec, works: Sequence[Sequence[Work]], limits: Limits
+) -> tuple[dict[str, float], dict[str, ChunkResult]]:
     """(seconds of one core per chunk, a result) of each kind, from the chunks of each phase."""
     seconds: dict[str, float] = {}
     answers: dict[str, ChunkResult] = {}
-    with inline_engine(spec, Limits(1)) as engine:
+    with inline_engine(spec, limits) as engine:
         for work in works:
             kind, (answer,) = _kind(work[0]), engine.evaluate(work[:1])  # which compiles
             answers[kind] = answer

@@ -88,6 +88,7 @@ def test_bench_scaling_predicts_a_row_per_number_of_workers():
     eight = ("--set", "compute.worker_resources.cpu=8", "--set", "compute.engine=ray")
     code, printed = es("bench", "scaling", "point_maze_es", *eight, "--workers", "16,12")
     assert (code, "8 cores each do not divide 12 workers" in printed) == (2, True)
+    assert "efficiency" not in printed, "an error has no heading of a table"
 
 
 @pytest.mark.long
