@@ -25,9 +25,10 @@ from es_service.loop.state import RunState, no_observations
 from es_service.protocol.content import Policy
 from es_service.protocol.episodes import METRICS
 from es_service.protocol.messages import Moments
-from es_service.runs.certification import certify_run, default_measure
+from es_service.runs.certification import TOP, certify_run, default_measure, different
 from es_service.runs.certified import EPISODES, Certified, certified_policies
 from es_service.runs.checked_config import changed_config, changes_from, load_config
+from es_service.runs.evaluation import candidates
 from es_service.runs.snapshot import Snapshot
 from es_service.runs.view import Run, named_best, named_by_all, open_run
 from es_service.search.algorithms import ALGORITHMS
@@ -336,7 +337,8 @@ def certified_for(
 ) -> list[Certified]:
     """Newest certified policies of a run as polishing compares them: with as many episodes as `certify_run` takes, of
     which none has decided that the run is over, and selected by the same measure before and after, from the run as it
-    is now. What is not certified so is certified now.
+    is now, among no fewer candidates than `certify_run` takes, or tried by the run itself. What is not certified so is
+    certified now.
 
     Args:
         config: that of the run that polishes.
@@ -346,10 +348,13 @@ def certified_for(
         RunLockedError: a driver writes to the run. Otherwise as `certify_run`.
     """
     by, steps = default_measure(config), int(run.history_rows(run.generation)[-1]["env_steps"])
+    top = TOP if run.constants["map.enabled"] else 0
+    least = len(different(candidates(run, best=True, centre=centre, cells=(), every=False, top=top)))
     certified = [
-        policy
-        for policy in certified_policies(run.folder)
-        if (policy.selected_by, policy.env_steps) == (by, steps) and policy.episodes.count >= EPISODES
+        one
+        for one in certified_policies(run.folder)
+        if (one.selected_by, one.env_steps) == (by, steps) and one.episodes.count >= EPISODES
+        if one.tries or (one.candidates >= least and (one.candidates > 1 or one.name == "best"))
     ]
     if certified:
         newest = max(policy.number for policy in certified)

@@ -206,6 +206,16 @@ def test_a_certification_of_an_earlier_state_is_not_compared(parent, tmp_path):
     assert (new.number, new.env_steps) == (old.number + 1, run.history["env_steps"].iloc[-1])
 
 
+def test_a_certification_of_chosen_policies_is_not_compared(parent, tmp_path):
+    run = api.open_run(shutil.copytree(parent.folder, tmp_path / "run"))
+    cell = run.map.iloc[-1][["cell_x", "cell_y"]].astype(int).tolist()
+    [chosen] = certify_run(run.folder, best=False, cells=[cell], top=0, workers=1)
+    [compared] = certified_for(run, polish_config(run.folder), lambda notice: None, workers=1)
+    assert compared.number != chosen.number
+    assert compared.candidates > chosen.candidates == 1
+    assert certified_for(run, polish_config(run.folder), pytest.fail, workers=1)[0].number == compared.number
+
+
 def test_nothing_is_certified_before_what_is_wrong_is_told(parent, tmp_path):
     run = api.open_run(shutil.copytree(parent.folder, tmp_path / "run"))
     certified = len(run.certified)
