@@ -117,7 +117,14 @@ def array_problem(
             return f"has an array {name!r} of {array.dtype} {array.shape}, which no run of these sizes has"
         if name in _FINITE and not np.isfinite(array).all():
             return f"has an array {name!r} with values that are not finite"
+        if name == "descriptor_N_B" and _beyond_float32(array).any():
+            return f"has an array {name!r} with values that float32 cannot hold"
     return ""
+
+
+def _beyond_float32(values: np.ndarray) -> np.ndarray:
+    """Where values are finite, but would not be as float32, which workers return."""
+    return np.isfinite(values) & (np.abs(values) > np.finfo(np.float32).max)
 
 
 def _fits(axis: str, length: int, lengths: dict[str, int]) -> bool:
@@ -149,8 +156,7 @@ def _problem_of_values(kind: str, arrays: Mapping[str, np.ndarray], sizes: Sizes
 def _overflows(mean_O: np.ndarray, m2_O: np.ndarray, count: np.ndarray) -> bool:
     """Whether finite statistics of observations, which are float32, have a mean or a standard deviation that is not."""
     with np.errstate(all="ignore"):
-        values = np.abs([mean_O, np.sqrt(m2_O / np.maximum(count, 1.0))])
-    return bool((np.isfinite(values) & (values > np.finfo(np.float32).max)).any())
+        return bool(_beyond_float32(np.array([mean_O, np.sqrt(m2_O / np.maximum(count, 1.0))])).any())
 
 
 def _problem_of_geometry(arrays: Mapping[str, np.ndarray], sizes: Sizes) -> str:

@@ -22,7 +22,7 @@ import pytest
 from es_service import api, load_config
 from es_service.cli.main import app
 from es_service.errors import ConfigError, ServiceError, StoreError
-from es_service.loop.blocks import BEST, OBSERVATIONS
+from es_service.loop.blocks import ARCHIVE, BEST, OBSERVATIONS
 from es_service.loop.forms import Sizes, problem
 from es_service.protocol.content import NAME
 from es_service.report.data import read_run
@@ -188,6 +188,8 @@ SIZES = Sizes(parameters=4, observation=2, dimensions=2, cells=None, bounds=())
         (OBSERVATIONS, {"count": 2.0, "mean_O": [0.0, 0.0], "m2_O": [1.0, 1e300]}, "has statistics"),
         (OBSERVATIONS, {"count": 2.0, "mean_O": [0.0, 1e300], "m2_O": [1.0, 1.0]}, "has statistics"),
         (OBSERVATIONS, {"count": 0.0, "mean_O": [0.0, 0.0], "m2_O": [0.0, 0.0]}, ""),
+        (ARCHIVE, {"descriptor_N_B": [[0.0, 1e300]], "generation_N": [0], "centre_N": [0]}, "has an array 'descr"),
+        (ARCHIVE, {"descriptor_N_B": [[0.0, -3e38]], "generation_N": [0], "centre_N": [0]}, ""),
     ],
 )
 def test_values_that_no_state_has_are_named(name, arrays, what):
