@@ -323,6 +323,11 @@ class Actors:
             self._watch.close()
         # The logs of a Ray of our own are not needed if workers got places and none was lost.
         self._connection.keeps_logs |= self._has_lost or not self._places
+        if not self._connection.answers():
+            # For an actor of which the head does not know yet, Ray would wait for the head, and after a minute end this
+            # process before the reason is told.
+            self._handles.clear()
+            self._waiting = []
         busy = set(self._calls.oldest()) | self._drained
         idle = [self._handles.pop(worker) for worker in sorted(self._up - busy) if worker in self._handles]
         for worker in list(self._handles):

@@ -197,8 +197,11 @@ def shortage(ray: ModuleType, claim: Claim, nodes: Membership | None) -> str:
             return f"Each worker needs {claim}; the head node of the cluster does not answer"
     if nodes is None:
         advice = "The processes of the workers do not start or are very slow"
-    elif nodes.room:
-        advice = "Add nodes to the cluster, or stop other programs that use it"
+    elif any(nodes.free.values()):
+        advice = "There is room, so the processes of the workers are still starting"
+    elif nodes.room:  # Ray does not say whose the used CPUs are
+        still = "If no other program uses it, the processes of the workers are still starting"
+        advice = f"{still}; otherwise stop that program, or add nodes"
     else:
         advice = f"No node has {claim}; add one that does, or lower compute.worker_resources"
     return f"{demand(ray, claim)}. {advice}"

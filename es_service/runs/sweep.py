@@ -37,6 +37,7 @@ from es_service.runs.run_status import INSIDE, recent_durations, write_groups
 from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.sweep_plan import Labelled, PlannedRun, ValuesOfKeys, plan
+from es_service.runs.tracking import FAILING
 from es_service.runs.view import open_run
 from es_service.runs.worker_count import shared
 from es_service.store.folder import explained, holds_run
@@ -264,7 +265,7 @@ def run_planned(
     """Run what `plan` has returned for the folder `out`; otherwise as `sweep`.
 
     Args:
-        on_notice: called with a sentence on how the cores are shared.
+        on_notice: called with a sentence on how the cores are shared, and what a run says of a tracker that failed.
         options: further options of `es-service run` for each run.
         certifying: when runs are certified; None: never.
     """
@@ -294,6 +295,8 @@ def run_planned(
                 for name in [name for name, of in running.items() if of.has_ended()]:
                     of = running.pop(name)
                     runs[name] = _ended(runs[name], of)
+                    for said in _said_of_trackers(of):
+                        on_notice(f"{name}: {said}")
                     idle += [] if of.code else [of.process]  # what has failed may have left something behind
                     if runs[name].state == "waiting":
                         _start(of.command, inside, runs, running, idle)
@@ -390,14 +393,26 @@ def _ended(run: SweptRun, of: _Running) -> SweptRun:
         if of.command.next_words() not in ([], of.command.before):
             return replace(run, state="waiting", row=row)
         return replace(run, state="finished" if state == "waiting" else state, row=row, reason=reason)
-    lines = []
-    with suppress(OSError), of.log.open("rb") as log:
-        log.seek(max(of.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-        lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
+    lines = _last_lines(of)
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     last = f"{of.how}; its last line is: {lines[-1]}" if lines else of.how
     why = errors[-1] if errors else last
     return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {of.log})")
+
+
+def _last_lines(of: _Running) -> list[str]:
+    """The last lines that the command of a run has printed."""
+    try:
+        with of.log.open("rb") as log:
+            log.seek(max(of.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+            return log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
+    except OSError:
+        return []
+
+
+def _said_of_trackers(of: _Running) -> list[str]:
+    """What the command of a run has said of trackers that failed, which nobody reads in its log."""
+    return [line.removeprefix("note: ") for line in _last_lines(of) if line.startswith(f"note: {FAILING}")]
 
 
 def _at_first(planned: PlannedRun, certifying: Certifying | None) -> SweptRun:

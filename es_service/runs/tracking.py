@@ -13,21 +13,25 @@ import importlib
 import importlib.util
 import math
 import os
+import random
 import re
 import struct
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from es_service.config.text import unknown_name
-from es_service.errors import ConfigError, WayOut
+from es_service.errors import ConfigError, Interrupted, WayOut
 from es_service.loop.history import Row
 from es_service.runs.session import OnNotice
 from es_service.runs.view import Run, open_run
-from es_service.store.reader import read_history
+from es_service.store.reader import read_history, read_start
 
 PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 """Name of a tracker, which is also that of the extra of this package -> the module that it needs."""
@@ -36,8 +40,15 @@ PROJECT = "es-service"
 RUN_TAG = "es_service.run"
 MOST_ROWS = 1000
 """History rows that are read and sent at once."""
+LEVEL_BLOCK = 32768
+"""Bytes of a block in the files of Weights & Biases."""
 MLFLOW_BATCH = 1000
 """Most metrics that MLflow takes at once."""
+MLFLOW_STATUS: Mapping[Ending, str] = {"finished": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}
+MLFLOW_ATTEMPTS = 4
+
+
+Ending = Literal["finished", "failed", "interrupted"]
 
 
 class Tracker(Protocol):
@@ -51,7 +62,9 @@ class Tracker(Protocol):
         """Add history rows, whose generations are all newer than `newest`, in their order."""
         ...
 
-    def close(self) -> None: ...
+    def close(self, how: Ending = "finished") -> None:
+        """Send what is still here, and say how the session has ended."""
+        ...
 
 
 def check_trackers(names: Sequence[str]) -> None:
@@ -97,16 +110,21 @@ def metrics(row: Row) -> dict[str, float]:
     }
 
 
-def _time(run: Run, row: Row) -> float:
-    """Seconds since 1970 at which a generation is shown: pauses between sessions are left out."""
-    return datetime.fromisoformat(run.meta.created).timestamp() + row["wall_clock_s"]
+def _begin(run: Run) -> float:
+    """Seconds since 1970 at which generation 0 is shown, to which `wall_clock_s` is added: so pauses between sessions
+    are left out. The rows that a fork has from its parent end when the fork was created."""
+    created, parent = datetime.fromisoformat(run.meta.created).timestamp(), run.meta.parent
+    if parent is None or read_start(run.folder) is not None:
+        return created
+    inherited = read_history(run.folder, parent["generation"], 1)
+    return created - (inherited[0]["wall_clock_s"] if inherited else 0.0)
 
 
 class TensorBoard:
     """Event files in `RUN/tensorboard` or another folder; their names contain the run's id."""
 
     def __init__(self, run: Run, folder: Path | None = None) -> None:
-        self._run, self._folder = run, folder or run.folder / "tensorboard"
+        self._run, self._folder, self._begin = run, folder or run.folder / "tensorboard", _begin(run)
         self._writer: Any = None
 
     def files(self) -> list[Path]:
@@ -131,12 +149,14 @@ class TensorBoard:
                 self._writer = made_by.EventsWriter(str(self._folder / "events"), suffix)
             values = [summary.Value(tag=name, simple_value=value) for name, value in metrics(row).items()]
             self._writer.write_event(
-                event(wall_time=_time(self._run, row), step=row["generation"], summary=summary(value=values))
+                event(
+                    wall_time=self._begin + row["wall_clock_s"], step=row["generation"], summary=summary(value=values)
+                )
             )
         if rows:
             self._writer.flush()
 
-    def close(self) -> None:
+    def close(self, how: Ending = "finished") -> None:
         if self._writer is not None:
             self._writer.close()
 
@@ -155,8 +175,9 @@ def _records(data: bytes) -> Iterator[bytes]:
 class Wandb:
     """A run of Weights & Biases with the id of our run; its files are in `RUN/wandb`.
 
-    Without a network (WANDB_MODE=offline), the server cannot say what it has, so the newest generation is noted in a
-    file beside those that `wandb sync` uploads.
+    Without a network (WANDB_MODE=offline), the files that `wandb sync` uploads say what they have. So does a note
+    beside them, since `wandb sync --clean` deletes them; rows of a session that was killed may be on no disk, so it is
+    written at the end.
     """
 
     def __init__(self, run: Run) -> None:
@@ -164,7 +185,8 @@ class Wandb:
         shared = wandb.setup(wandb.Settings(silent=True)).settings
         if shared.mode == "online" and not wandb.login(prompt=False):
             raise PermissionError("there is no API key; set WANDB_API_KEY, or WANDB_MODE=offline")
-        self._note = run.folder / "wandb" / f"{run.run_id}.newest"
+        self._begin, self._newest = _begin(run), -1
+        self._folder, self._id = run.folder / "wandb", run.run_id
         self._entry = wandb.init(
             project=shared.project or PROJECT,
             id=run.run_id,
@@ -176,31 +198,59 @@ class Wandb:
         )
 
     def newest(self) -> int:
-        if self._entry.offline:
-            return int(self._note.read_text()) if self._note.exists() else -1
-        return self._entry.starting_step - 1
+        if not self._entry.offline:
+            return self._entry.starting_step - 1
+        record = importlib.import_module("wandb.proto.wandb_internal_pb2").Record
+        files = self._folder.glob(f"offline-run-*/run-{self._id}.wandb")
+        stored = (record.FromString(one) for file in files for one in _level_records(file.read_bytes()))
+        steps = [one.history.step.num for one in stored if one.HasField("history")]
+        noted = [int(self._note.read_text())] if self._note.exists() else []
+        return max([*steps, *noted], default=-1)
+
+    @property
+    def _note(self) -> Path:
+        return self._folder / f"{self._id}.newest"
 
     def log(self, rows: Sequence[Row]) -> None:
         for row in rows:
-            self._entry.log(metrics(row), step=row["generation"], commit=True)
-        if rows:
-            self._note.parent.mkdir(exist_ok=True)
-            self._note.write_text(str(rows[-1]["generation"]))
+            time_s = {"_timestamp": self._begin + row["wall_clock_s"]}
+            self._entry.log(metrics(row) | time_s, step=row["generation"], commit=True)
+            self._newest = row["generation"]
 
-    def close(self) -> None:
-        self._entry.finish()
+    def close(self, how: Ending = "finished") -> None:
+        self._entry.finish(exit_code=0 if how == "finished" else 1)
+        if self._entry.offline and self._newest >= 0:
+            self._note.write_text(str(self._newest))
+
+
+def _level_records(data: bytes) -> Iterator[bytes]:
+    """Records of a file of Weights & Biases, up to one that is torn or damaged. Behind seven bytes, it is of the form
+    of a log of LevelDB."""
+    at, record = 7, b""
+    while at + 7 <= len(data):
+        room = LEVEL_BLOCK - at % LEVEL_BLOCK
+        if room < 7:  # the rest of a block is empty
+            at += room
+            continue
+        crc32, length, kind = struct.unpack_from("<IHB", data, at)
+        end = at + 7 + length
+        if end > len(data) or zlib.crc32(data[at + 6 : end]) != crc32:
+            return
+        record += data[at + 7 : end]
+        at = end
+        if kind in (1, 4):  # a whole record, or the last part of one
+            yield record
+            record = b""
 
 
 class MLflow:
     """A run of MLflow; since MLflow chooses the ids of its runs, ours is its tag `es_service.run`."""
 
     def __init__(self, run: Run) -> None:
-        self._run = run
+        self._begin = _begin(run)
         self._entities = importlib.import_module("mlflow.entities")
         self._client = importlib.import_module("mlflow.tracking").MlflowClient()
-        name = os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT)
-        experiment = self._client.get_experiment_by_name(name)
-        at = experiment.experiment_id if experiment is not None else self._client.create_experiment(name)
+        at = self._experiment(os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT))
         runs = self._client.search_runs([at], f"tags.`{RUN_TAG}` = '{run.run_id}'")
         if runs:
             self._id = runs[0].info.run_id
@@ -211,13 +261,26 @@ class MLflow:
         settings = [self._entities.Param(_key(key), str(value)) for key, value in run.constants.items()]
         self._client.log_batch(self._id, params=settings)
 
+    def _experiment(self, name: str) -> str:
+        """The id of an experiment, which is made if there is none. Other runs of a sweep may make it, and the tables of
+        a new database, at the same moment, on which MLflow raises errors of many kinds."""
+        for attempt in range(1, MLFLOW_ATTEMPTS + 1):
+            try:
+                experiment = self._client.get_experiment_by_name(name)
+                return self._client.create_experiment(name) if experiment is None else experiment.experiment_id
+            except Exception:
+                if attempt == MLFLOW_ATTEMPTS:
+                    raise
+                time.sleep(attempt * random.random())
+        raise AssertionError
+
     def newest(self) -> int:
         return max((metric.step for metric in self._client.get_metric_history(self._id, "env_steps")), default=-1)
 
     def log(self, rows: Sequence[Row]) -> None:
         batch: list[Any] = []
         for row in rows:
-            milliseconds = round(1000 * _time(self._run, row))
+            milliseconds = round(1000 * (self._begin + row["wall_clock_s"]))
             values = metrics(row)
             if len(batch) + len(values) > MLFLOW_BATCH:
                 self._client.log_batch(self._id, metrics=batch)
@@ -229,8 +292,8 @@ class MLflow:
         if batch:
             self._client.log_batch(self._id, metrics=batch)
 
-    def close(self) -> None:
-        self._client.set_terminated(self._id)
+    def close(self, how: Ending = "finished") -> None:
+        self._client.set_terminated(self._id, MLFLOW_STATUS[how])
 
 
 def _key(name: str) -> str:
@@ -241,8 +304,16 @@ def _key(name: str) -> str:
 PAUSE_S = 1.0
 """Seconds between two readings of the history, so that a fast run is read in larger pieces."""
 FINISH_S = 30.0
-"""Longest wait for a tracker at the end of a session."""
-_LATER = "the run does not need it, and the next session that uses this tracker sends what it lacks"
+"""Longest wait for all trackers at the end of a session."""
+INTERRUPTED_S = 10.0
+"""The same after an interruption."""
+TELL_S = 1.0
+"""Wait for a tracker after which it is told."""
+MOST_LETTERS = 300
+"""Letters of a tracker's error that are shown."""
+FAILING = "the tracker"
+"""The first words of what is said of a tracker that failed."""
+_LATER = "the run does not need it, and once it works again, the next session that uses it sends what it lacks"
 
 Open = Callable[[str, Run], Tracker]
 
@@ -268,10 +339,10 @@ def tracked(
         ConfigError: a tracker is unknown, or its package is not installed.
     """
     check_trackers(names)
-    ended = threading.Event()
+    end = _End(threading.Event())
 
     def thread(name: str) -> threading.Thread:
-        work = (folder, name, opened, ended, on_notice)
+        work = (folder, name, opened, end, on_notice)
         return threading.Thread(target=_follow, args=work, name=f"tracker {name}", daemon=True)
 
     threads = {name: thread(name) for name in names}
@@ -284,18 +355,37 @@ def tracked(
     try:
         yield begin
         begin()  # a session without a generation: a tracker may lack rows of earlier ones
+    except BaseException as error:
+        end.how = "interrupted" if isinstance(error, Interrupted | KeyboardInterrupt) else "failed"
+        raise
     finally:
-        ended.set()
-        for name, tracker_thread in threads.items():
-            if tracker_thread.ident is not None:  # else no generation was run, and the folder may hold another run
-                tracker_thread.join(FINISH_S)
-            if tracker_thread.is_alive():
-                on_notice(f"the tracker {name} did not finish within {FINISH_S:g} s; {_LATER}")
+        end.has_come.set()
+        # Of a session in which no generation was run, none has begun: the folder may hold another run.
+        begun = {name: one for name, one in threads.items() if one.ident is not None}
+        _wait(begun, INTERRUPTED_S if end.how == "interrupted" else FINISH_S, on_notice)
 
 
-def _follow(
-    folder: str | os.PathLike[str], name: str, opened: Open, ended: threading.Event, on_notice: OnNotice
-) -> None:
+@dataclass
+class _End:
+    """Whether and how a session has ended."""
+
+    has_come: threading.Event
+    how: Ending = "finished"
+
+
+def _wait(threads: Mapping[str, threading.Thread], longest_s: float, on_notice: OnNotice) -> None:
+    """Wait for the threads of trackers, together at most for some time."""
+    until = time.monotonic() + longest_s
+    for name, thread in threads.items():
+        thread.join(min(TELL_S, max(0.0, until - time.monotonic())))
+        if thread.is_alive() and (left_s := until - time.monotonic()) > 0.0:
+            on_notice(f"waiting for the tracker {name}, at most {left_s:.0f} s; Ctrl-C ends the wait")
+            thread.join(left_s)
+        if thread.is_alive():
+            on_notice(f"{FAILING} {name} did not finish within {longest_s:g} s; {_LATER}")
+
+
+def _follow(folder: str | os.PathLike[str], name: str, opened: Open, end: _End, on_notice: OnNotice) -> None:
     """The work of a tracker's thread."""
     try:
         run = open_run(folder)
@@ -303,9 +393,10 @@ def _follow(
         newest = tracker.newest()
         last = False
         while not last:
-            last = ended.wait(PAUSE_S)  # first, so that metrics of the first generation are recorded by then
+            last = end.has_come.wait(PAUSE_S)  # first, so that metrics of the first generation are recorded by then
             newest = fill(tracker, run, newest, has_ended=last)
-        tracker.close()
+        tracker.close(end.how)
     except Exception as error:  # whatever a tracker raises must not end the run
         reason = str(error).partition("\n")[0]
-        on_notice(f"the tracker {name} failed ({type(error).__name__}: {reason}); {_LATER}")
+        reason = reason if len(reason) <= MOST_LETTERS else f"{reason[:MOST_LETTERS]} ..."
+        on_notice(f"{FAILING} {name} failed ({type(error).__name__}: {reason}); {_LATER}")

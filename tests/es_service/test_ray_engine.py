@@ -327,7 +327,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
     [
         (None, {}, "do not start"),
         (PretendedWatch(), {}, "No node has 1 CPU"),
-        (PretendedWatch(), {"n": 2}, "Add nodes"),
+        (PretendedWatch(), {"n": 2}, "or add nodes"),
     ],
 )
 def test_a_run_that_got_no_place_says_what_it_needs_and_what_there_is(watch, rooms, advice):
@@ -351,7 +351,7 @@ def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypa
 
     def should_stop() -> int | None:
         calls.append(len(ray.actors))
-        if told and "Add nodes" in told[-1] and len(calls) > 3:
+        if told and "add nodes" in told[-1] and len(calls) > 3:
             ray.room = 2
             ray.end(ray.actors[-1], "alive")
         return None
@@ -477,6 +477,34 @@ def test_a_message_that_is_damaged_once_costs_one_attempt():
     with ray_engine(ray, limits) as engine:
         assert engine.evaluate(with_subject(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 1
+
+
+def test_no_actor_is_killed_through_a_head_that_does_not_answer():
+    """Ray would wait for it, and end this process after a minute."""
+    ray, limits = PretendedRay(), Limits(2)
+    with ray_engine(ray, limits) as engine:
+        engine.evaluate(with_subject(FIRST, [CHUNK]))
+
+        def check_alive(nodes: list[bytes], timeout: float) -> None:
+            raise ActorDiedError("timed out while waiting for GCS")
+
+        client = SimpleNamespace(check_alive=check_alive)
+        ray._private.worker = SimpleNamespace(global_worker=SimpleNamespace(gcs_client=client))
+    assert [actor.state for actor in ray.actors] == ["alive", "alive"]
+
+
+@pytest.mark.parametrize(
+    ("free", "advice"),
+    [
+        ({"node": 1}, "There is room, so the processes of the workers are still starting"),
+        ({"node": 0}, "If no other program uses it, the processes of the workers are still starting; otherwise"),
+    ],
+)
+def test_a_wait_for_processes_that_start_is_not_taken_for_a_full_cluster(free, advice):
+    ray, watch, limits = PretendedRay(), PretendedWatch(), Limits(2)
+    watch.now = Membership({"node": 2}, free, frozenset(), frozenset({"node"}))
+    with Engine(actors := transport(ray, limits, watch), limits):
+        assert actors.shortage().partition(" free. ")[2].startswith(advice)
 
 
 @pytest.mark.parametrize("grows", [False, True])
@@ -784,7 +812,7 @@ def test_a_connection_serves_only_runs_of_the_same_cluster_and_environment(stays
         monkeypatch.chdir(tmp_path)
         compute("head:6379")
         compute("head:6379")
-        monkeypatch.setattr(ray_cluster, "ask_head", lambda ray: 1 / 0)
+        monkeypatch.setattr(ray_cluster, "ask_head", lambda ray: 1 / (ray.job - 4))  # the head of the fourth is gone
         compute("head:6379")
     assert (made, len(ray.actors)) == ([None, *["head:6379"] * 4], 10)
 

@@ -1,18 +1,21 @@
 """Trackers get every row of a history once, whatever happens to them, and nothing that they do reaches the run."""
 
+import contextlib
 import importlib
 import json
 import os
+import shutil
 import struct
 import sys
 import threading
 import time
+from datetime import datetime
 
 import numpy as np
 import pytest
 
-from es_service import open_run
-from es_service.errors import ConfigError, StoreError
+from es_service import api, open_run
+from es_service.errors import ConfigError, Interrupted, StoreError
 from es_service.runs import tracking
 from es_service.runs.export import export
 from es_service.runs.tracking import PACKAGES, TensorBoard, _key, check_trackers, fill, metrics, open_tracker
@@ -39,8 +42,8 @@ class Recorder:
                 raise OSError("no such host\nand more")
             self.kept.append(int(row["generation"]))
 
-    def close(self):
-        self.closed = True
+    def close(self, how):
+        self.closed = how
 
 
 @pytest.fixture
@@ -63,7 +66,7 @@ def test_what_a_tracker_lacks_is_sent_once(folder, lag):
     recorder = Recorder(kept)
     assert session(folder, lambda: recorder) == []
     assert kept == list(range(max(21, 21 - lag)))
-    assert recorder.closed
+    assert recorder.closed == "finished"
 
 
 def test_a_session_without_a_generation_sends_what_is_lacking(folder):
@@ -226,6 +229,56 @@ def test_mlflow_allows_no_other_letters():
     assert _key("centre_x (m): é$") == "centre_x _m__ __"
 
 
+def test_the_rows_that_a_fork_has_of_its_parent_end_when_it_was_created(folder, tmp_path):
+    parent, began_s = open_run(folder), time.time()
+    fork = api.fork(folder, {"budget.generations": 21}, out=tmp_path / "fork", on_notice=lambda notice: None).run
+    tracker = open_tracker("tensorboard", fork)
+    fill(tracker, fork, -1)
+    tracker.close()
+    *_, inherited, own = events(tracker.files())
+    assert parent.history_rows()[-1]["wall_clock_s"] > 1.0
+    assert inherited.wall_time == pytest.approx(datetime.fromisoformat(fork.meta.created).timestamp(), abs=1e-3)
+    assert began_s - 1.0 <= inherited.wall_time <= own.wall_time <= time.time()
+
+
+@pytest.mark.parametrize(
+    ("error", "how"),
+    [(None, "finished"), (Interrupted("SIGTERM"), "interrupted"), (StoreError("the disk is full"), "failed")],
+)
+def test_a_tracker_is_told_how_the_session_has_ended(folder, error, how):
+    def body(committed):
+        committed({})
+        if error is not None:
+            raise error
+
+    recorder = Recorder([])
+    with contextlib.nullcontext() if error is None else pytest.raises(type(error)):
+        session(folder, lambda: recorder, body)
+    assert (recorder.closed, recorder.kept) == (how, list(range(21)))
+
+
+def test_an_interruption_waits_for_all_trackers_together_and_says_so(folder, monkeypatch):
+    for name, value in {"INTERRUPTED_S": 0.3, "TELL_S": 0.1}.items():
+        monkeypatch.setattr(tracking, name, value)
+    free, notices = threading.Event(), []
+    begun_s = time.monotonic()
+    names = ["tensorboard", "tensorboardX"]
+    monkeypatch.setattr(tracking, "check_trackers", lambda names: None)
+
+    def interrupted():
+        with tracking.tracked(folder, names, notices.append, lambda name, run: free.wait(60)) as committed:
+            committed({})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - begun_s < tracking.FINISH_S
+    free.set()
+    assert notices[0] == f"waiting for the tracker {names[0]}, at most 0 s; Ctrl-C ends the wait"
+    ended = [f"the tracker {name} did not finish within 0.3 s" for name in names]
+    assert [notice.partition(";")[0] for notice in notices[1:]] == ended
+
+
 def sessions(folder, name):
     """Two sessions with a real tracker, of which the first got only a part of the history."""
     run = open_run(folder)
@@ -248,14 +301,70 @@ def test_wandb_has_every_row_once(folder, monkeypatch):
 
     monkeypatch.setenv("WANDB_MODE", "offline")
     sessions(folder, "wandb")
-    steps, ids = [], set()
-    for file in sorted((folder / "wandb").glob("offline-run-*/*.wandb")):
-        for data in blocks(file.read_bytes()):
-            record = Record.FromString(data)
-            steps += [record.history.step.num] if record.HasField("history") else []
-            ids |= {record.run.run_id} if record.HasField("run") else set()
-    assert steps == list(range(21))
-    assert ids == {open_run(folder).run_id}
+    wait_for_wandb(folder)
+
+    def records():
+        for file in sorted((folder / "wandb").glob("offline-run-*/*.wandb")):
+            yield from map(Record.FromString, blocks(file.read_bytes()))
+
+    rows = [record.history for record in records() if record.HasField("history")]
+    assert [row.step.num for row in rows] == list(range(21))
+    assert {record.run.run_id for record in records() if record.HasField("run")} == {open_run(folder).run_id}
+    for row, stored in zip(rows, open_run(folder).history_rows(), strict=True):
+        shown = {item.nested_key[0] if item.nested_key else item.key: json.loads(item.value_json) for item in row.item}
+        assert shown["_timestamp"] == pytest.approx(1735689600 + stored["wall_clock_s"], abs=1e-3)
+        assert shown["best_fitness"] == stored["best_fitness"]
+
+
+def wait_for_wandb(folder):
+    """Its process writes the end of a file a moment after it has said that it has finished."""
+    before, end_s = -1, time.monotonic() + 30
+    while (size := sum(file.stat().st_size for file in folder.glob("wandb/offline-run-*/*.wandb"))) != before:
+        assert time.monotonic() < end_s
+        before = size
+        time.sleep(1.5)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("lost", ["the note", "the files", "the last row and the note"])
+def test_wandb_s_files_and_the_note_beside_them_say_what_it_has(folder, monkeypatch, lost):
+    """A session that was killed has written no note; `wandb sync --clean` deletes the files."""
+    pytest.importorskip("wandb", reason="this test needs the extra wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run = open_run(folder)
+    tracker = open_tracker("wandb", run)
+    fill(tracker, run, -1)
+    tracker.close()
+    wait_for_wandb(folder)
+    if "note" in lost:
+        [note] = (folder / "wandb").glob("*.newest")
+        note.unlink()
+    [kept] = (folder / "wandb").glob("offline-run-*")
+    if lost == "the files":
+        shutil.rmtree(kept)
+    if "row" in lost:
+        [file] = kept.glob("*.wandb")
+        at = file.read_bytes().rfind(b"best_fitness")
+        file.write_bytes(file.read_bytes()[:at])
+    again = open_tracker("wandb", run)
+    assert again.newest() == (19 if "row" in lost else 20)
+    again.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_wandb_that_is_disabled_has_nothing(folder, monkeypatch):
+    wandb = pytest.importorskip("wandb", reason="this test needs the extra wandb")
+    run = open_run(folder)
+    wandb.teardown()  # it keeps the mode of its first run in a process
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    tracker = open_tracker("wandb", run)
+    fill(tracker, run, -1)
+    tracker.close()
+    wandb.teardown()
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    again = open_tracker("wandb", run)
+    assert again.newest() == -1
+    again.close()
 
 
 def blocks(data):
@@ -288,6 +397,8 @@ def test_mlflow_has_every_row_once(folder, tmp_path, monkeypatch):
     history = client.get_metric_history(entry.info.run_id, "best_fitness")
     assert [one.step for one in history] == list(range(21))
     assert [one.value for one in history] == [row["best_fitness"] for row in open_run(folder).history_rows()]
+    open_tracker("mlflow", open_run(folder)).close("failed")
+    assert client.get_run(entry.info.run_id).info.status == "FAILED"
 
 
 @pytest.mark.parametrize("name", ["x/../../../victim/thesis", "*", "' OR tags.a = 'b", "A" * 32, "a" * 31, "a" * 33])

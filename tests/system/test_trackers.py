@@ -25,6 +25,18 @@ def test_a_run_survives_a_tracker_that_fails_and_fills_it_when_resumed(tmp_path)
     assert es("export", folder, "--to", "tensorboard")[0] == 0
 
 
+def test_a_sweep_says_which_of_its_runs_a_tracker_lacks(tmp_path):
+    command = ("sweep", "point_maze_me_es", "--seeds", "0:2", "--out", tmp_path / "sweep", "--workers", 1)
+    small = ("--set", "search.pairs=4", "--set", "task.episode_steps=20", "--set", "compute.engine=inline")
+    code, printed = es(*command, *small, "--set", "budget.generations=1")
+    assert code == 0, printed
+    (tmp_path / "sweep/seed=1/tensorboard").write_text("no folder")
+    code, printed = es(*command, *small, "--set", "budget.generations=2", "--log", "tensorboard")
+    assert code == 0, printed
+    assert printed.count("the tracker tensorboard failed") == 1
+    assert "note: seed=1: the tracker tensorboard failed" in printed
+
+
 def test_a_missing_tracker_ends_a_run_before_it_begins(tmp_path):
     code, printed = es("run", "point_maze_me_es", "--log", "tensorbord", "--out", tmp_path / "run")
     assert code == 2
