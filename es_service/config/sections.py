@@ -354,8 +354,8 @@ class ComputeConfig(Section):
     place_timeout_s: Positive | None = Field(
         None,
         description="With engine `ray` in a cluster: longest time in seconds for which the run waits for a first "
-        "place, before it stops and asks for no more places. `null`: as long as it takes. `status` says that the "
-        "run waits. The wait is no part of `budget.wall_clock_s`.",
+        "place, and for a process to start there, before it stops and asks for no more places. `null`: as long as "
+        "it takes. `status` says that the run waits. The wait is no part of `budget.wall_clock_s`.",
     )
     no_worker_timeout_s: Patience = Field(
         120.0,
