@@ -44,11 +44,11 @@ LEVEL_BLOCK = 32768
 """Bytes of a block in the files of Weights & Biases."""
 MLFLOW_BATCH = 1000
 """Most metrics that MLflow takes at once."""
-MLFLOW_STATUS: Mapping[Ending, str] = {"finished": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}
 MLFLOW_ATTEMPTS = 4
-
-
+"""Attempts to find or make an experiment."""
 Ending = Literal["finished", "failed", "interrupted"]
+"""How a session has ended."""
+MLFLOW_STATUS: Mapping[Ending, str] = {"finished": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}
 
 
 class Tracker(Protocol):
