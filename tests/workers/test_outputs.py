@@ -159,9 +159,8 @@ def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task, rollout):
         observation_mean_O=np.zeros(size, np.float32),
         observation_std_O=np.ones(size, np.float32),
     )
-    found = [
-        chunk_runner(replace(worker_spec, outputs=names))(ant, EvaluationChunk(1, 0)) for names in ((), tuple(OUTPUTS))
-    ]
+    names = tuple(OUTPUTS.keys() - {"metrics"})  # which ants do not have
+    found = [chunk_runner(replace(worker_spec, outputs=named))(ant, EvaluationChunk(1, 0)) for named in ((), names)]
     without, with_success = (result for result in found if isinstance(result, EpisodesResult))
     for name in ("fitness", "returns", "descriptor", "steps", "trace_T_B"):
         np.testing.assert_array_equal(getattr(without, name), getattr(with_success, name))

@@ -162,14 +162,14 @@ class Heat:
 
 
 @pytest.mark.parametrize(
-    ("size", "limit", "found"), [(12, 100, "144"), pytest.param(96, 8192, "9,216", marks=pytest.mark.long)]
+    ("size", "limit", "found"), [(12, 100, "144"), pytest.param(136, 16384, "18,496", marks=pytest.mark.long)]
 )
 def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand(
     size: int, limit: int, found: str, monkeypatch: pytest.MonkeyPatch
 ):
     """With a limit that a small plate exceeds, and with that of the compiler."""
     monkeypatch.setattr(Heat, "size", size)
-    if size < 96:
+    if size < 136:
         monkeypatch.setattr(emit, "MOST_SLOTS", limit)
     task = describe_environment(f"{__name__}:Heat")
     why = rollout.why_not(task)
