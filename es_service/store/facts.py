@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import reprlib
+import sqlite3
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from functools import cache
@@ -43,6 +44,11 @@ POLICY = ("hidden", "activation", "output", "bias", "memory")
 
 class Damaged(Exception):  # noqa: N818 (caught inside the store, which then repairs or reports the damage)
     """A database is damaged; the message describes the damage, with "it" for the file."""
+
+
+def said_by(error: Exception) -> str:
+    """What an error says, without the bytes of a text that is no UTF-8, which SQLite's repeats with its newlines."""
+    return str(error).partition(" with text ")[0] if isinstance(error, sqlite3.Error) else str(error)
 
 
 def _known_time(text: str) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.protocol.content import names_in
 from es_service.store.codec import RowValues, row_dict
-from es_service.store.facts import GENERATION, Damaged
+from es_service.store.facts import GENERATION, Damaged, said_by
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, is_no_damage, require_run_folder
 from es_service.store.lock import lock_holder
 from es_service.store.records import (
@@ -104,7 +104,7 @@ def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError | Unicode
     is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
     what = "cannot be read" if is_database else "is not a run folder"
     way_out = WayOut("resume", "repair it as far as possible, if it is a run", str(folder))
-    return StoreError(f"{folder} {what}: {error}", run=folder, ways_out=[way_out])
+    return StoreError(f"{folder} {what}: {said_by(error)}", run=folder, ways_out=[way_out])
 
 
 EvaluatedCentres = list[dict[str, int | float]]

@@ -16,7 +16,7 @@ from typing import Any
 from es_service.errors import StoreError
 from es_service.protocol.content import Arrays
 from es_service.store.codec import row_dict
-from es_service.store.facts import GENERATION, Damaged
+from es_service.store.facts import GENERATION, Damaged, said_by
 from es_service.store.folder import COPY
 from es_service.store.reader import connected_to, reading
 from es_service.store.records import metric_columns, metric_values, sound_platforms, stored_metrics
@@ -188,7 +188,7 @@ def _noted(problems: list[str], what: str) -> Iterator[None]:
     try:
         yield
     except (sqlite3.Error, Damaged, ValueError, TypeError, KeyError) as error:
-        problems.append(f"{what}: {error}")
+        problems.append(f"{what}: {said_by(error)}")
 
 
 class _Rows:

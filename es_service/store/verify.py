@@ -9,7 +9,7 @@ from pathlib import Path
 
 from es_service.protocol.content import names_in
 from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
-from es_service.store.facts import Damaged
+from es_service.store.facts import Damaged, said_by
 from es_service.store.folder import is_no_damage
 from es_service.store.records import CertifiedKey, certified_rows, load_start, row_name, sound_platforms, stored_metrics
 from es_service.store.rows import history_rows
@@ -64,7 +64,7 @@ def verify(connection: sqlite3.Connection, file: Path, known: int = 0) -> Verdic
     except sqlite3.Error as error:
         if is_no_damage(error, file.parent):
             raise
-        raise Damaged(f"SQLite reports: {error}") from error
+        raise Damaged(f"SQLite reports: {said_by(error)}") from error
     except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise Damaged(f"it contains values that es-service never writes: {error}") from error
 

@@ -466,6 +466,15 @@ def test_table_statements_that_are_not_utf_8_are_noticed(tmp_path):
         shutil.copy(folder / "run.db", folder / "run.db.copy")
 
 
+def test_text_that_is_not_utf_8_is_not_repeated(tmp_path):
+    """SQLite's message has its bytes, of which one may be a newline."""
+    folder = finished(tmp_path / "run", 3)
+    execute(folder, r"UPDATE history SET state_sha256 = CAST(X'0A71EC24' AS TEXT) WHERE generation = 2")
+    with pytest.raises(StoreError, match="cannot be read: Could not decode to UTF-8") as caught:
+        read_history(folder)
+    assert caught.value.sentence.endswith("column 'state_sha256'")
+
+
 def test_another_platform_or_meta_is_noticed(tmp_path):
     with create(tmp_path / "run") as run:
         run.record_platform(0, {"cpu": "a"})
