@@ -148,6 +148,8 @@ class Child:
 
     def _answer(self, until_s: float) -> Any:
         """See `answer`. A process that the child has forked may hold its end of the socket open."""
+        if self.is_ended:  # its socket is closed
+            raise EOFError
         poll, is_over = select.poll(), False
         poll.register(self.socket, select.POLLIN)
         while not poll.poll(1000.0 * min(LOOK_S, max(0.0, until_s - time.monotonic()))):
@@ -165,9 +167,11 @@ class Child:
     @property
     def is_answered(self) -> bool:
         """Whether `answer` would not wait."""
-        has_ended, poll = self._process.poll() is not None, select.poll()
+        if self.is_ended or self._process.poll() is not None:
+            return True
+        poll = select.poll()
         poll.register(self.socket, select.POLLIN)
-        return bool(poll.poll(0)) or has_ended
+        return bool(poll.poll(0))
 
     def call(self, *request: Any, limit_s: float | None = None) -> Any:
         """`ask`, and the `answer`."""

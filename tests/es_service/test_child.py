@@ -60,6 +60,9 @@ def test_the_end_of_a_child_is_a_sentence_with_the_last_that_it_printed(tmp_path
         with pytest.raises(NoAnswerError) as late:
             child.answer(0.01)
         assert child.is_ended
+        assert child.is_answered
+        with pytest.raises(NoAnswerError, match="ended with"):
+            child.call("echo again")
     assert (str(late.value), late.value.is_late) == ("gave no answer within 0.01 s:\nwaits for a licence", True)
     with pytest.raises(RaisedError, match="cannot be imported"):
         answer_of(SHELL, "raises", limit_s=LONG_S)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from es_service.protocol.episodes import in_blocks
 from tests.helpers import spec
-from tests.system.processes import ROOT, is_running
+from tests.system.processes import ROOT, is_running, wait_for
 from tests.workers.test_worker import bits, work
 from workers import cores as module
 from workers.compiling import Compilable
@@ -245,4 +245,4 @@ def test_a_worker_and_its_child_processes_end_together(tmp_path, how, code):
     assert (b"a child process of this worker has ended" in done.stderr) == (how == "lose")
     children = [int(word) for word in done.stdout.split()]
     assert len(children) == 2
-    assert not any(map(is_running, children))
+    wait_for(lambda: not any(map(is_running, children)), 10.0)
