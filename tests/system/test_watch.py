@@ -225,7 +225,8 @@ def test_a_cell_is_chosen_by_pointer_or_keys_and_replayed(page, tmp_path):
         page.until(f"document.querySelector('#map .way')?.getAttribute('d') !== {json.dumps(way)}")
         chosen = page.text("#cell")
         assert chosen != first
-        assert page.text("#command").endswith(f"--cell {chosen.split(':')[0]}")
+        command = json.dumps(f"--cell {chosen.split(':')[0]}")  # it comes with the path of the last cell
+        page.until(f"document.querySelector('#command').textContent.endsWith({command})")
         page.key("Enter")
         page.until("!!document.querySelector('#shown #scrub')")
         assert "equal the stored ones bit for bit" in page.text("#shown")
