@@ -18,15 +18,15 @@ pytestmark = [pytest.mark.long, pytest.mark.alone, pytest.mark.timeout(7200)]
 
 
 def other_python() -> str:
-    """A newer Python than this one; skips without one."""
-    found = [
-        path
-        for name in PYTHONS
-        if (path := shutil.which(name)) and Path(path).resolve() != Path(sys.executable).resolve()
-    ]
-    if not found:
-        pytest.skip(f"none of {', '.join(PYTHONS)} is installed")
-    return found[0]
+    """A newer Python than this one; skips without one. A version manager's name for one that is not chosen does not
+    start."""
+    for name in PYTHONS:
+        path = shutil.which(name)
+        if path is None or Path(path).resolve() == Path(sys.executable).resolve():
+            continue
+        if subprocess.run([path, "--version"], capture_output=True, check=False).returncode == 0:
+            return path
+    pytest.skip(f"none of {', '.join(PYTHONS)} is installed")
 
 
 def lowest() -> str:
