@@ -39,20 +39,21 @@ from workers.environments.ant_tasks import DRAWN, MAZES, cells_of, goals_of, pla
 RUNS = Path(__file__).parents[2] / "runs" / "goals"
 RESULTS = Path(__file__).parent / "results" / "goal_archives.csv"
 EXPLORE_STEPS = {"ant_u_maze": 50_000_000, "ant_big_maze": 200_000_000, "ant_hardest_maze": 400_000_000}
-GOAL_STEPS = 25_000_000
+GOAL_STEPS = 50_000_000
 """Environment steps of the polish of each goal."""
 OBSERVATION = "task.options.observation=without_goal"
 """A policy of the archive is for one goal, and does not see that of the episode."""
 POLISH = (
-    "task.options.reward=dense",
     "search.pairs=32",
     "search.shaping.count=16",
     "search.screened=100",
     "search.candidates=6",
     "search.round_generations=12",
     "search.objective.radius=2",
+    "search.learning_rate_decay=0.994",
+    "search.learning_rate_limit=0.004",
 )
-"""Settings of the polish, from trials with seed 100."""
+"""Settings of the polish, from trials with seed 100 of ant_big_maze."""
 
 
 ONE_STEPS = 200_000_000
