@@ -245,6 +245,11 @@ class TargetObjective(ObjectivePart):
         "number for each dimension.",
     )
     radius: Positive = Field(1.0, description="Of kind `target`: greatest distance from the middle inside of the set.")
+    ties: Literal["share", "distance"] = Field(
+        "share",
+        description="Of kind `target`: how those rank that end inside with equal fitness. `share`: they share the mean "
+        "of their ranks. `distance`: the nearer to the middle, the higher, which helps where most have a reward of 0.",
+    )
 
 
 class NearnessObjective(ObjectivePart):

@@ -224,7 +224,8 @@ def target_values(target: TargetObjective, fitness: ArrayLike, descriptor_B: Arr
 
     So the first aim is that as many members as possible end in the set, and fitness decides only among those that do.
     Ranks and not values, since the scales of fitness and of distances have nothing to do with each other. Equal ones
-    share the mean of their ranks. Members whose fitness or descriptor is not finite are NaN.
+    share the mean of their ranks; with `ties: distance`, the nearer of equally fit ones ranks higher. Members whose
+    fitness or descriptor is not finite are NaN.
 
     Args:
         target: the set, a ball of descriptors; its border is inside.
@@ -238,9 +239,13 @@ def target_values(target: TargetObjective, fitness: ArrayLike, descriptor_B: Arr
     distance = np.linalg.norm(np.asarray(descriptor_B, np.float64) - np.asarray(target.descriptor), axis=-1)
     is_valid = np.isfinite(fitness) & np.isfinite(distance)
     is_inside = is_valid & (distance <= target.radius)
-    keys = np.stack([is_inside.astype(np.float64), np.where(is_inside, fitness, -distance)], axis=-1)
-    keys[~is_valid] = -np.inf
-    _, place = np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)  # in the order of the first, then the second
+    keys = [is_inside.astype(np.float64), np.where(is_inside, fitness, -distance)]
+    if target.ties == "distance":
+        keys.append(-distance)
+    of_each = np.stack(keys, axis=-1)
+    of_each[~is_valid] = -np.inf
+    # In the order of the first key, then of the second, then of the third.
+    _, place = np.unique(of_each.reshape(-1, len(keys)), axis=0, return_inverse=True)
     return np.where(is_valid, centred_ranks(place.reshape(fitness.shape)), np.nan)
 
 

@@ -75,7 +75,9 @@ def test_each_goal_has_a_config_that_ranks_by_it(parent):
         assert isinstance(search, CandidatesConfig)
         assert config.task.options == {"goal": label}
         assert (search.algorithm, search.candidate_choice) == ("polish", "place")
-        assert search.objective.model_dump() == {"kind": "target", "descriptor": place, "radius": 0.05}
+        assert search.objective.model_dump() == {
+            "kind": "target", "descriptor": place, "radius": 0.05, "ties": "distance",
+        }  # fmt: skip
         assert config.budget.env_steps == -(-steps // 2)
         assert task_of(config).goal is None, "the descriptor is no place in the plane"
     assert "env_steps" not in goal_configs(parent.folder, ["left"], {"budget.generations": 3})[0].source["budget"]  # type: ignore[index]

@@ -69,6 +69,24 @@ def test_equal_members_of_a_target_set_share_a_rank_and_invalid_ones_have_none()
     assert np.allclose(both_P_S, [[-1 / 6, 1 / 6], [-0.5, 0.5]])
 
 
+def test_of_equally_fit_members_of_a_target_set_the_nearer_ranks_higher_if_distance_decides():
+    places = [[0.0], [0.9], [-0.5], [0.1], [2.0], [-0.5]]
+    fitness = [0.0, 1.0, 0.0, 0.0, 5.0, 0.0]
+    share, distance = (
+        target_values(TargetObjective(descriptor=(0.0,), radius=1.0, ties=ties), fitness, places)
+        for ties in ("share", "distance")
+    )
+    assert order(share) == [1, 0, 2, 3, 5, 4]
+    assert share[0] == share[2] == share[3] == share[5]
+    assert order(distance) == [1, 0, 3, 2, 5, 4]
+    assert distance[2] == distance[5]  # equally far
+    without_ties = np.random.default_rng(0).normal(size=6)
+    assert (
+        target_values(TargetObjective(descriptor=(0.0,), ties="distance"), without_ties, places)
+        == target_values(TargetObjective(descriptor=(0.0,)), without_ties, places)
+    ).all()
+
+
 def test_adding_a_constant_to_the_fitness_changes_no_rank_of_a_target_set():
     rng = np.random.default_rng(0)
     fitness, places = rng.normal(size=40), rng.normal(size=(40, 2))
