@@ -213,8 +213,8 @@ class Wandb:
 
     def log(self, rows: Sequence[Row]) -> None:
         for row in rows:
-            time_s = {"_timestamp": self._begin + row["wall_clock_s"]}
-            self._entry.log(metrics(row) | time_s, step=row["generation"], commit=True)
+            ended_at = {"_timestamp": self._begin + row["wall_clock_s"]}
+            self._entry.log(metrics(row) | ended_at, step=row["generation"], commit=True)
             self._newest = row["generation"]
 
     def close(self, how: Ending = "finished") -> None:
