@@ -248,7 +248,7 @@ class TargetObjective(ObjectivePart):
     ties: Literal["share", "distance"] = Field(
         "share",
         description="Of kind `target`: how those rank that end inside with equal fitness. `share`: they share the mean "
-        "of their ranks. `distance`: the nearer to the middle, the higher, which helps where most have a reward of 0.",
+        "of their ranks. `distance`: the nearer to the middle, the higher; for rewards that are 0 in most of the set.",
     )
 
 

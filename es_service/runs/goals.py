@@ -30,8 +30,8 @@ def goal_configs(
     """For each goal the config of a run that polishes policies of another run for this goal, for `sweep`.
 
     Each begins with the policies that ended nearest to the goal, and ranks by it: those that end within the goal's
-    radius by their fitness, and equally fit ones and all others by their distance. Unless `overrides` set a limit, all
-    of them together have the number of environment steps of the other run as their budget.
+    radius by their fitness, the others by their distance. Unless `overrides` set a limit, all of them together have the
+    number of environment steps of the other run as their budget.
 
     Args:
         parent: folder of the other run.
@@ -60,7 +60,7 @@ def goal_configs(
 
 
 def _for_goal(source: Mapping[str, Any], name: str, place: Sequence[float], radius: float) -> dict[str, Any]:
-    objective = {"kind": "target", "descriptor": list(place), "radius": radius, "ties": "distance"}
+    objective = {"kind": "target", "descriptor": list(place), "radius": radius}
     task, search = source["task"], source["search"]
     return {
         **source,

@@ -50,6 +50,7 @@ POLISH = (
     "search.candidates=6",
     "search.round_generations=12",
     "search.objective.radius=2",
+    "search.objective.ties=distance",
     "search.learning_rate_decay=0.994",
     "search.learning_rate_limit=0.004",
 )

@@ -76,7 +76,7 @@ def test_each_goal_has_a_config_that_ranks_by_it(parent):
         assert config.task.options == {"goal": label}
         assert (search.algorithm, search.candidate_choice) == ("polish", "place")
         assert search.objective.model_dump() == {
-            "kind": "target", "descriptor": place, "radius": 0.05, "ties": "distance",
+            "kind": "target", "descriptor": place, "radius": 0.05, "ties": "share",
         }  # fmt: skip
         assert config.budget.env_steps == -(-steps // 2)
         assert task_of(config).goal is None, "the descriptor is no place in the plane"
