@@ -4,7 +4,8 @@ A tracker knows the newest generation that it has of a run, and takes the rows a
 whenever it is opened. Its entry is found again by the run's id. Each package is imported when its tracker is opened.
 
 Each tracker has a thread, which reads committed rows from the store and sends those that the tracker does not have. So
-the driver never waits for a tracker, and a tracker that stopped in the middle gets what it lacks in the next session.
+the driver never waits for a tracker, and one that failed gets what it lacks when it works again, in this session or the
+next.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -307,13 +308,15 @@ FINISH_S = 30.0
 """Longest wait for all trackers at the end of a session."""
 INTERRUPTED_S = 10.0
 """The same after an interruption."""
+AGAIN_S = 60.0
+"""Seconds after which a tracker that failed is opened again."""
 TELL_S = 1.0
 """Wait for a tracker after which it is told."""
 MOST_LETTERS = 300
 """Letters of a tracker's error that are shown."""
 FAILING = "the tracker"
 """The first words of what is said of a tracker that failed."""
-_LATER = "the run does not need it, and once it works again, the next session that uses it sends what it lacks"
+_LATER = "the run does not need it, and the next session that uses it sends what it lacks"
 
 Open = Callable[[str, Run], Tracker]
 
@@ -386,17 +389,40 @@ def _wait(threads: Mapping[str, threading.Thread], longest_s: float, on_notice: 
 
 
 def _follow(folder: str | os.PathLike[str], name: str, opened: Open, end: _End, on_notice: OnNotice) -> None:
-    """The work of a tracker's thread."""
-    try:
-        run = open_run(folder)
-        tracker = opened(name, run)
-        newest = tracker.newest()
-        last = False
-        while not last:
-            last = end.has_come.wait(PAUSE_S)  # first, so that metrics of the first generation are recorded by then
-            newest = fill(tracker, run, newest, has_ended=last)
-        tracker.close(end.how)
-    except Exception as error:  # whatever a tracker raises must not end the run
-        reason = str(error).partition("\n")[0]
-        reason = reason if len(reason) <= MOST_LETTERS else f"{reason[:MOST_LETTERS]} ..."
-        on_notice(f"{FAILING} {name} failed ({type(error).__name__}: {reason}); {_LATER}")
+    """The work of a tracker's thread. A tracker that fails is opened again after `AGAIN_S`, and at the end of the
+    session if it has worked before: it may have been out of reach for a while of a long run."""
+    has_worked = is_failing = False
+    while True:
+        tracker = None
+        try:
+            run = open_run(folder)
+            tracker = opened(name, run)
+            newest = tracker.newest()
+            has_worked, last = True, False
+            while not last:
+                last = end.has_come.wait(PAUSE_S)  # first, so that the metrics of the first generation are recorded
+                newest = fill(tracker, run, newest, has_ended=last)
+                if is_failing:
+                    on_notice(f"{FAILING} {name} works again and has what it lacked")
+                is_failing = False
+            tracker.close(end.how)
+            return
+        except Exception as error:  # whatever a tracker raises must not end the run
+            if not is_failing:
+                on_notice(_failed(name, error))
+            is_failing = True
+        if end.has_come.is_set():
+            return
+        with suppress(Exception):
+            if tracker is not None:
+                tracker.close("failed")
+        if end.has_come.wait(AGAIN_S) and not has_worked:
+            return
+
+
+def _failed(name: str, error: Exception) -> str:
+    reason = str(error).partition("\n")[0]
+    reason = reason if len(reason) <= MOST_LETTERS else f"{reason[:MOST_LETTERS]} ..."
+    return (
+        f"{FAILING} {name} failed ({type(error).__name__}: {reason}). It is tried again every {AGAIN_S:g} s; {_LATER}"
+    )

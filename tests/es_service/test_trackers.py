@@ -122,10 +122,39 @@ def test_a_tracker_that_fails_costs_one_notice_and_is_filled_in_the_next_session
             committed({})
 
     [notice] = session(folder, opened, body)
-    assert notice.startswith("the tracker tensorboard failed (OSError: no such host); the run does not need it")
+    assert notice.startswith("the tracker tensorboard failed (OSError: no such host). It is tried again")
     assert kept == list(range(0 if fails == "at opening" else fails))
     assert session(folder, lambda: Recorder(kept)) == []
     assert kept == list(range(21))
+
+
+@pytest.mark.parametrize("again_s", [0.01, 60.0])
+def test_a_tracker_that_fails_for_a_while_gets_every_row_once(folder, monkeypatch, again_s):
+    """It is opened again after a time, and at the end of the session."""
+    monkeypatch.setattr(tracking, "PAUSE_S", 0.01)
+    monkeypatch.setattr(tracking, "AGAIN_S", again_s)
+    kept, works, notices = [], threading.Event(), []
+    first = Recorder(kept, fails_at=9)
+    answers = iter([first, OSError("no such host"), OSError("no such host")] if again_s < 1.0 else [first])
+
+    def opened(name, run):
+        answer = next(answers, None)
+        if isinstance(answer, OSError):
+            raise answer
+        if answer is None:
+            works.set()
+        return answer or Recorder(kept)
+
+    with tracking.tracked(folder, [NAME], notices.append, opened) as committed:
+        committed({})
+        until = time.monotonic() + 60
+        while not (works.is_set() if again_s < 1.0 else notices) and time.monotonic() < until:
+            time.sleep(0.01)
+    assert (kept, first.closed) == (list(range(21)), "failed")
+    assert [notice.partition(" (")[0] for notice in notices] == [
+        "the tracker tensorboard failed",
+        "the tracker tensorboard works again and has what it lacked",
+    ]
 
 
 def test_a_tracker_that_hangs_holds_up_neither_the_run_nor_its_end(folder, monkeypatch):
