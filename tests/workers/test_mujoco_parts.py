@@ -133,24 +133,23 @@ def sliding_balls(cone: str) -> MjModel:
     ("cone", "within"), [("pyramidal", 1e-4), pytest.param("elliptic", 2e-3, marks=pytest.mark.long)]
 )
 def test_forces_are_the_same_however_many_contacts_are_solved_at_once(cone: str, within: float):
-    """In states with few contacts, and in states with more than are solved at once."""
+    """In states with one contact, with two, and with more than are solved at once."""
     model, rng = sliding_balls(cone), np.random.default_rng(0)
     mx = mujoco_parts.put_model(model)
     data: Any = mujoco_parts.mjx.make_data(mx)
     qpos = (rng.choice([-1e-3, 0.3], (64, model.nq)) * rng.random((64, model.nq))).astype(np.float32)
     qvel = rng.normal(0.0, 0.3, qpos.shape).astype(np.float32)
 
-    def forward(at_once: int, qpos: Any, qvel: Any) -> tuple[Any, ...]:
+    def forward(at_once: tuple[int, ...], qpos: Any, qvel: Any) -> tuple[Any, ...]:
         state = mujoco_parts.start(mx, qpos, qvel)
         found = mujoco_parts._forward(mx, mujoco_parts._data(data, state, np.zeros(0)), at_once)
         return found.qacc, found.qfrc_constraint, found._impl.efc_force, found._impl.contact.dist
 
-    *right, dist = compile_kernel(functools.partial(forward, 1000), qpos[0], qvel[0])(qpos, qvel)
+    *right, dist = compile_kernel(functools.partial(forward, (1000,)), qpos[0], qvel[0])(qpos, qvel)
     groups = [np.flatnonzero(data._impl.contact.dim == dim) for dim in (3, 4)]
     most = np.max([(dist < 0)[:, group].sum(1) for group in groups], axis=0)
-    assert (most <= 1).sum() >= 5
-    assert (most > 1).sum() >= 5
-    few = compile_kernel(functools.partial(forward, 1), qpos[0], qvel[0])
+    assert min((most <= 1).sum(), (most == 2).sum(), (most > 2).sum()) >= 5
+    few = compile_kernel(functools.partial(forward, (1, 2)), qpos[0], qvel[0])
     for ours, all_at_once in zip(few(qpos, qvel), right, strict=False):
         scale = float(np.abs(all_at_once).max())
         assert scale > 1.0

@@ -8,7 +8,7 @@ links, and the sum of the contact impulses. `ant_mujoco.py` has the ant in MuJoC
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -97,9 +97,13 @@ class Ant(NamedTuple):
     """Brax's system; None in MuJoCo's physics."""
 
 
-def ant_in(physics: str, walls: tuple[Segment, ...]) -> Ant:
+def ant_in(physics: str, walls: tuple[Segment, ...], at_once: Sequence[int]) -> Ant:
     """The ant of a task in the physics that its option names: `spring`, `mujoco` with the integrator RK4 of `ant.xml`,
     or `mujoco_euler`, which takes a quarter of the time.
+
+    Args:
+        at_once: contacts that are solved at once in MuJoCo's physics, for an ant that lies on its back, too; see
+            `mujoco_contacts.solve`. They have no influence but on the speed, and by rounding.
 
     Raises:
         TaskError: what the physics needs is not installed.
@@ -108,7 +112,7 @@ def ant_in(physics: str, walls: tuple[Segment, ...]) -> Ant:
         return make_ant(walls)
     from workers.environments import ant_mujoco
 
-    return ant_mujoco.make_ant(walls, "RK4" if physics == "mujoco" else "Euler")
+    return ant_mujoco.make_ant(walls, "RK4" if physics == "mujoco" else "Euler", at_once)
 
 
 def make_ant(walls: tuple[Segment, ...] = (), near: int | None = None) -> Ant:
@@ -276,7 +280,7 @@ def ant_maze(physics: str = "spring") -> Environment:
     Args:
         physics: see `ant_in`.
     """
-    ant = ant_in(physics, MAZE_WALLS)
+    ant = ant_in(physics, MAZE_WALLS, at_once=(5, 8))
 
     def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
         state = ant.step(state, action)
@@ -322,7 +326,7 @@ def ant_trap(physics: str = "spring", contact_forces: str = "computed") -> Envir
         contact_forces: `computed`, as in Gym's ant and in the benchmark; or `zero` in observations and in the reward,
             as with mujoco-py and MuJoCo 2, which did not compute them.
     """
-    ant = ant_in(physics, TRAP_WALLS)
+    ant = ant_in(physics, TRAP_WALLS, at_once=(4, 8))
 
     def forces(state: Any) -> Any:
         return ant.contact_forces(state) if contact_forces == "computed" else jnp.zeros(6 * BODIES, jnp.float32)

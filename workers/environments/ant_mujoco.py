@@ -6,7 +6,7 @@ The model is that of `ant_model.py`, which C MuJoCo steps in `gymnasium:es_servi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from workers.environments.ant import Ant, joint_noise
 from workers.environments.ant_model import SUBSTEPS, ant_model, boxes_of, compiled, first_qpos
 from workers.environments.ant_tasks import FORCE_LIMIT, JOINTS, STEP_S
 from workers.environments.brax_task import quietly
+from workers.environments.mujoco_contacts import AT_ONCE
 from workers.environments.mujoco_parts import (
     MujocoState,
     mjx,
@@ -205,11 +206,12 @@ class MujocoAntState(NamedTuple):
         return self.physics.qvel
 
 
-def make_ant(walls: tuple[Segment, ...] = (), integrator: str = "RK4") -> Ant:
+def make_ant(walls: tuple[Segment, ...] = (), integrator: str = "RK4", at_once: Sequence[int] = AT_ONCE) -> Ant:
     """Build the ant of a task.
 
     Args:
         integrator: that of the model, `RK4`, or `Euler`.
+        at_once: as in `mujoco_contacts.solve`.
 
     Raises:
         TaskError: the package gymnasium, which has the ant's model, is not installed.
@@ -232,7 +234,7 @@ def make_ant(walls: tuple[Segment, ...] = (), integrator: str = "RK4") -> Ant:
     @once
     def step(state: MujocoAntState, action: Any) -> MujocoAntState:
         ctrl = jnp.clip(action, -1.0, 1.0)
-        return MujocoAntState(*step_and_look(mx, state.physics, ctrl, SUBSTEPS, look, contacts=contacts))
+        return MujocoAntState(*step_and_look(mx, state.physics, ctrl, SUBSTEPS, look, at_once, contacts))
 
     viewer = mujoco_viewer(ant_model(walls, drawn=True), mx, STEP_S, lambda state: state.physics)
     return Ant(reset, step, viewer, lambda state: jnp.clip(state.force.ravel(), -FORCE_LIMIT, FORCE_LIMIT))

@@ -9,7 +9,7 @@ active contacts at most.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -34,8 +34,9 @@ SHORTEST = 1e-15
 """Least length of a vector that has a direction, in metres, as in C MuJoCo (`mjMINVAL`)."""
 HALVINGS = 24
 """Halvings of a capsule's axis, after which a point is known to a float32 ulp of its length."""
-AT_ONCE = 4
-"""Active contacts of each `condim` that are solved without the places of the others, if there are more places."""
+AT_ONCE = (4,)
+"""Numbers of active contacts of each `condim` that are solved without the places of the others, if there are at least
+twice as many places. An ant that walks has at most four, in nearly all states."""
 
 
 @contextlib.contextmanager
@@ -112,24 +113,71 @@ def _from_cylinder(point: Any, size: Any) -> tuple[Any, Any]:
     return jnp.where(is_corner, corner, jnp.maximum(beside, beyond)), jnp.where(is_corner, from_corner, direction)
 
 
-def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:
+def solve(model: mjx.Model, data: Any, at_once: Sequence[int] = AT_ONCE) -> Any:
     """Data with the accelerations and the forces of the constraints, which `mjx.solver.solve` looks for.
 
-    The first `at_once` active contacts of each `condim` are solved without the other places. Only where more are
-    active, all places are solved afterwards. Both solutions are the same but for rounding, since the rows of a contact
-    that is not active are 0.
+    The first of `at_once` active contacts of each `condim` are solved without the other places. Only where more are
+    active, so many as the next number says are solved afterwards, and in the end all places. All solutions are the same
+    but for rounding, since the rows of a contact that is not active are 0.
 
     Args:
         data: what `mjx.forward` has computed before it solves, contacts and their rows included.
+        at_once: numbers of contacts, which grow. Those are left out that are more than half of the places.
     """
     contact = data._impl.contact
     groups = [np.flatnonzero(contact.dim == dim) for dim in np.unique(contact.dim)]
-    counts = [min(at_once, len(group)) for group in groups]
-    if not groups or len(contact.dim) < 2 * sum(counts):
+    fewer = [count for count in at_once if groups and 2 * sum(_counts(groups, count)) <= len(contact.dim)]
+    if not fewer:
         return _converged(model, data)
     active = contact.dist < contact.includemargin
     numbers = [jnp.cumsum(active[group].astype(jnp.int32)) for group in groups]
-    places = [_first(number, count) for number, count in zip(numbers, counts, strict=True)]
+    most = jnp.stack([number[-1] for number in numbers]).max()
+
+    def solved(count: int, contact: Any) -> tuple[Any, Any, Any]:
+        """Accelerations, the constraints' forces on them, and the forces of all rows."""
+        if count == len(contact.dim):
+            after = _solve(model, data, contact, contact.dim)
+            return after.qacc, after.qfrc_constraint, after._impl.efc_force
+        return _solved_of_few(model, data, contact, groups, numbers, count)
+
+    results = solved(fewer[0], contact)
+    for before, count in zip(fewer, [*fewer[1:], len(contact.dim)], strict=True):
+
+        def again(carry: Any, count: int = count) -> Any:
+            """Solved anew. It carries where the contacts are, so that their rows are computed only here."""
+            _, dist, pos, _ = carry
+            after = solved(count, contact.replace(dist=dist, pos=pos))
+            return jnp.bool_(False), jnp.zeros_like(dist), jnp.zeros_like(pos), after
+
+        wanted = (most > before) & (most <= count)
+        begun = wanted, contact.dist, contact.pos, results
+        *_, results = jax.lax.while_loop(lambda carry: carry[0], again, begun)
+    qacc, qfrc, forces = results
+    return data.tree_replace({"qacc": qacc, "qfrc_constraint": qfrc, "_impl.efc_force": forces})
+
+
+def _counts(groups: Sequence[np.ndarray], count: int) -> list[int]:
+    """How many contacts of each group are solved at once."""
+    return [min(count, len(group)) for group in groups]
+
+
+def _solved_of_few(
+    model: mjx.Model,
+    data: Any,
+    contact: Any,
+    groups: Sequence[np.ndarray],
+    numbers: Sequence[Any],
+    count: int,
+) -> tuple[Any, Any, Any]:
+    """What is solved with the first active contacts of each group.
+
+    Args:
+        groups: numbers of the places of each `condim`.
+        numbers: as in `_first`, of each group.
+        count: most contacts of each group.
+    """
+    counts = _counts(groups, count)
+    places = [_first(number, least) for number, least in zip(numbers, counts, strict=True)]
 
     def chosen(x: Any) -> Any:
         return jnp.concatenate([x[group].at[at].get(mode="clip") for group, at in zip(groups, places, strict=True)])
@@ -137,7 +185,7 @@ def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:
     few = jax.tree.map(chosen, contact)
     is_one = jnp.concatenate([at < len(group) for group, at in zip(groups, places, strict=True)])
     few = few.replace(dist=jnp.where(is_one, few.dist, few.includemargin))
-    dim = np.concatenate([contact.dim[group[:count]] for group, count in zip(groups, counts, strict=True)])
+    dim = np.concatenate([contact.dim[group[:least]] for group, least in zip(groups, counts, strict=True)])
     found = _solve(model, data, few, dim)
     ends = np.append(contact.efc_address, data._impl.nefc)
     forces, first = [found._impl.efc_force[: ends[0]]], ends[0]
@@ -146,19 +194,7 @@ def solve(model: mjx.Model, data: Any, at_once: int = AT_ONCE) -> Any:
         of_slots = found._impl.efc_force[first : first + rows * len(at)].reshape(len(at), rows)
         forces.append(jnp.zeros((len(group), rows)).at[at].set(of_slots, mode="drop").reshape(-1))
         first += rows * len(at)
-
-    def with_all(carry: Any) -> Any:
-        """Solved with all places. It carries where the contacts are, so that their rows are computed only here."""
-        _, dist, pos, _ = carry
-        after = _solve(model, data, contact.replace(dist=dist, pos=pos), contact.dim)
-        after = after.qacc, after.qfrc_constraint, after._impl.efc_force
-        return jnp.bool_(False), jnp.zeros_like(dist), jnp.zeros_like(pos), after
-
-    more = jnp.stack([number[-1] > count for number, count in zip(numbers, counts, strict=True)]).any()
-    results = found.qacc, found.qfrc_constraint, jnp.concatenate(forces)
-    begun = more, contact.dist, contact.pos, results
-    *_, (qacc, qfrc, forces) = jax.lax.while_loop(lambda carry: carry[0], with_all, begun)
-    return data.tree_replace({"qacc": qacc, "qfrc_constraint": qfrc, "_impl.efc_force": forces})
+    return found.qacc, found.qfrc_constraint, jnp.concatenate(forces)
 
 
 def _first(numbers: Any, count: int) -> Any:

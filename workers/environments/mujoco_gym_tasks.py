@@ -35,7 +35,7 @@ class GymTask(NamedTuple):
     parts: Callable[..., Parts]
     """Function from a `Simulated` and options, by name."""
     episode_steps: int = 1000
-    at_once: int = AT_ONCE
+    at_once: tuple[int, ...] = AT_ONCE
     """Contacts that are solved at once; see `mujoco_contacts.solve`."""
 
 
@@ -290,7 +290,7 @@ TASKS = {
     "Walker2d-v5": GymTask("walker2d_v5.xml", 4, _walker2d),
     "Swimmer-v5": GymTask("swimmer.xml", 4, _swimmer),
     "Humanoid-v5": GymTask("humanoid.xml", 5, humanoid),
-    "HumanoidStandup-v5": GymTask("humanoidstandup.xml", 5, humanoid_standup, at_once=8),
+    "HumanoidStandup-v5": GymTask("humanoidstandup.xml", 5, humanoid_standup, at_once=(8,)),
     "Reacher-v5": GymTask("reacher.xml", 2, _reacher, 50),
     "Pusher-v5": GymTask("pusher_v5.xml", 5, _pusher, 100),
     "InvertedPendulum-v5": GymTask("inverted_pendulum.xml", 2, _inverted_pendulum),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -121,7 +121,7 @@ def step_and_look(
     ctrl: Any,
     substeps: int,
     look: Callable[[mjx.Data], Any],
-    at_once: int = AT_ONCE,
+    at_once: Sequence[int] = AT_ONCE,
     contacts: Mapping[Any, Any] = MappingProxyType({}),
 ) -> tuple[MujocoState, Any]:
     """As `step`, with what a function sees in the data of the last substep.
@@ -131,8 +131,8 @@ def step_and_look(
 
     Args:
         look: function from data to a pytree of arrays.
-        at_once: contacts of each `condim` that are computed first; only where more are active, all are computed. The
-            number changes the speed, and results by rounding.
+        at_once: numbers of contacts that are solved without all others, as in `mujoco_contacts.solve`. They change the
+            speed, and results by rounding.
         contacts: functions that find contacts of two types of geoms, in place of those of MJX.
     """
     integrate = _runge_kutta if model.opt.integrator == types.IntegratorType.RK4 else _single_stage
@@ -252,7 +252,7 @@ def _unsolved(model: mjx.Model, data: Any) -> Any:
     return forward_of_mjx.fwd_acceleration(model, forward_of_mjx.fwd_actuation(model, data))
 
 
-def _forward(model: mjx.Model, data: Any, at_once: int) -> Any:
+def _forward(model: mjx.Model, data: Any, at_once: Sequence[int]) -> Any:
     """`mjx.forward` with the constraints solved by `mujoco_contacts.solve`, whose argument `at_once` is."""
     data = _unsolved(model, data)
     if not data._impl.efc_J.size:
