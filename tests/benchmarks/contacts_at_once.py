@@ -57,8 +57,8 @@ def main() -> None:
                 driven(step, state, actions[name][:ROUND_STEPS])
                 rate = ANTS * ROUND_STEPS / (time.process_time() - began)
                 rows.append({"at once": str(at_once), "actions": name, "steps/s": rate})
-    print(cpu_kind())
-    print(pd.DataFrame(rows).groupby(["actions", "at once"])["steps/s"].median().round(-2).unstack("actions").to_string())
+    rates = pd.DataFrame(rows).groupby(["actions", "at once"])["steps/s"].median().round(-2)
+    print(cpu_kind(), rates.unstack("actions").to_string(), sep="\n")
 
 
 if __name__ == "__main__":
