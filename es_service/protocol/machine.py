@@ -147,7 +147,7 @@ def process_cpu_s(process: int) -> float:
         return 0.0
 
 
-VERSION = "0.37.0"
+VERSION = "0.38.0"
 """Version of es-service, written here because the metadata of an editable installation keep the version of the last
 `pip install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
