@@ -5,7 +5,7 @@
     python -m tests.benchmarks.goals --tasks ant_u_maze --seeds 100:101 --set search.screened=64     # a trial
     python -m tests.benchmarks.goals --one --seeds 0:5                   # one policy for all goals of a maze
     python -m tests.benchmarks.goals --table                             # only print the table
-    python -m tests.benchmarks.goals --draw ant_u_maze                   # the picture, of the run folders of seed 0
+    python -m tests.benchmarks.goals --draw ant_u_maze                   # the picture, of the run folder of seed 0
 
 `es-service run ant_big_maze_memes` explores the maze, and `es-service polish --goals all` makes a policy for each goal,
 with which a new episode starts when that goal is drawn. Each goal and seed is a row of results/goal_archives.csv: the
@@ -123,8 +123,8 @@ def table(rows: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def draw(task: str) -> None:
-    """The maze with its goals, and the way of each certified policy of seed 0 in its episode of median return."""
+def draw(task: str, seed: int) -> None:
+    """The maze with its goals, and the way of each certified policy of a seed in its episode of median return."""
     import matplotlib.pyplot as plt
     from matplotlib.patches import Circle
 
@@ -138,12 +138,12 @@ def draw(task: str) -> None:
     for number, (goal, at) in enumerate(goals_of(task).items()):
         colour = plt.get_cmap("turbo")((number + 0.5) / len(goals_of(task)))
         [replay], _ = record(
-            open_run(RUNS / f"{task}_0" / "polish" / f"{goal}_run"), best=False, cells=(), certified=True
+            open_run(RUNS / f"{task}_{seed}" / "polish" / f"{goal}_run"), best=False, cells=(), certified=True
         )
         way_T_2 = np.asarray(replay.recording.descriptor_T_B)
         axes.plot(*way_T_2.T, color=colour, linewidth=1.2)
         axes.add_patch(Circle(at, 0.5, facecolor="none", edgecolor=colour, linewidth=2.5))
-    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{task}: the way of each goal's policy")
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{task}, seed {seed}: the way of each policy")
     figure.savefig(RESULTS.with_name(f"goals_{task}.png"), dpi=90)
 
 
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--draw", choices=list(MAZES))
     given = parser.parse_args()
     if given.draw:
-        draw(given.draw)
+        draw(given.draw, seeds_of(given.seeds)[0])
         return
     settings = " ".join(given.settings)
     for task in () if given.table else given.tasks:
